@@ -7,14 +7,111 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from porrima.errors import InputError
 from porrima.moments import KernelMoments, moments_of_points
+from porrima.multiplicity import multiplicity_scale
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from porrima.multiplicity import CompanionLaw, MultiplicityModel
+    from porrima.orbits import Projection
+    from porrima.photometry import MassLuminosity, Tracks
+    from porrima.stars import Stars
+
     FloatArray = NDArray[np.float64]
 
-__all__ = ["Systems"]
+__all__ = ["BRIGHT_MASS", "Population", "Systems"]
+
+BRIGHT_MASS = 1.5
+"""Largest mass of a star kept, in M_sun: multiplicity is badly known above (KCM16 Sect. 4.3)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Population:
+    """Stars with the law of their companions, and when a survey resolves a pair: what systems are drawn from.
+
+    Simulation and prediction both start here; one draws from it, the other integrates over it.
+
+    Parameters
+    ----------
+    stars : Stars
+        The n primaries, with the magnitude of the whole system.
+    law : CompanionLaw
+        Statistics of their companions.
+    tracks : Tracks
+        Mass-luminosity relation with each star's place in it.
+    projection : {"isotropic", "inclination-uniform"}
+        Orientation of the orbits.
+    cut : float
+        Projected separation at or above which a pair is resolved and leaves the sample, in arcsec.
+    """
+
+    stars: Stars
+    law: CompanionLaw
+    tracks: Tracks
+    projection: Projection
+    cut: float
+
+    @classmethod
+    def of(
+        cls,
+        stars: Stars,
+        *,
+        multiplicity: MultiplicityModel,
+        photometry: MassLuminosity,
+        cut: float = 0.05,
+    ) -> Population:
+        """Population of given stars.
+
+        Parameters
+        ----------
+        stars : Stars
+            Those of one stack: already selected by magnitude, at least one.
+        multiplicity : MultiplicityModel
+            Gives the law of the companions.
+        photometry : MassLuminosity
+            Gives flux ratios, in the band of the stars.
+        cut : float
+            Separation from which a pair is resolved, in arcsec, positive.
+
+        Returns
+        -------
+        population : Population
+            Of the n stars.
+
+        Raises
+        ------
+        InputError
+            If there are no stars, one lies outside the range of a model, or the cut is not positive.
+        """
+        if len(stars) == 0:
+            raise InputError("no star is left after selection", source=stars.source or None)
+        if not 0 < cut < np.inf:
+            raise InputError("must be positive and finite [arcsec]", key="cut", value=cut)
+        try:
+            law = multiplicity.companions(stars.mass)
+            tracks = photometry.tracks(stars.mass, stars.metallicity, stars.log_age, stars.band)
+        except ValueError as error:
+            raise InputError(str(error), source=stars.source or None) from None
+        return cls(stars=stars, law=law, tracks=tracks, projection=multiplicity.projection, cut=cut)
+
+    def scale(self, binary_fraction: FloatArray | None) -> FloatArray:
+        """Factor on all multiplicity fractions for each wanted binary fraction; see `multiplicity_scale`.
+
+        Parameters
+        ----------
+        binary_fraction : (k,) float array or None
+            Before resolved pairs leave, in [0, 1]; None for the model's own.
+
+        Returns
+        -------
+        scale : (k,) float array
+            Dimensionless; (1,) of 1 for None.
+        """
+        if binary_fraction is None:
+            return np.ones(1)
+        return multiplicity_scale(self.law.multiplicity_fraction, binary_fraction)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
