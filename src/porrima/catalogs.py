@@ -1,22 +1,305 @@
-"""Real catalogues to `Stars`: the Besançon model's output, or any table with named columns."""
+"""Real catalogues to `Stars`: the output of the Besançon model, or any table with named columns."""
 
 from __future__ import annotations
 
-import gzip
 import os
-import re
-import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from porrima.besancon import SIGNATURE as BESANCON
+from porrima.besancon import read_besancon
 from porrima.errors import InputError
 from porrima.stars import COMPONENTS, Stars
-from porrima.tables import Table, load_table, write_table
+from porrima.tables import SKY_AREA, CatalogFile, CatalogRows, column_values, load_table, open_catalog, refuse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
+    BoolArray = NDArray[np.bool_]
+
+__all__ = ["READERS", "Catalog", "read_catalog", "write_stars"]
+
+REQUIRED = {"mass": "solMass", "distance": "pc", "magnitude": "mag"}
+"""Columns that a table must have, with the unit of a bare number."""
+
+OPTIONAL = {"metallicity": "dex", "log_age": "dex(yr)", "component": "", "luminosity_class": ""}
+"""Columns that it may have."""
+
+_ASSUMED = {"metallicity": 0.0, "log_age": 9.7}  # the Sun's, as `Stars.from_columns` takes them
+_MAIN_SEQUENCE = 5  # luminosity class V
+_NO_MAGNITUDE = 50.0  # catalogues write 99, -99 or 99.999 where a star has none
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Catalog:
+    """Main-sequence stars of a catalogue, and an account of every row that is not among them.
+
+    Parameters
+    ----------
+    stars : Stars
+        The stars, in the order of the file.
+    format : str
+        The key of `READERS` that the file was read with.
+    n_rows : int
+        Count of the rows of the file: the stars and the rejected ones.
+    rejected : mapping of str to int
+        Reason and count of the rows left out; each row counts once, under the first reason that holds.
+    assumed : mapping of str to int
+        Count of the stars for which something was taken that the file does not say.
+    pointing : (float, float), optional
+        Galactic longitude and latitude in deg, where all the rows have the same.
+    """
+
+    stars: Stars
+    format: str
+    n_rows: int
+    rejected: Mapping[str, int]
+    assumed: Mapping[str, int]
+    pointing: tuple[float, float] | None = None
+
+
+def read_catalog(
+    path: str | os.PathLike[str],
+    format: str | None = None,  # noqa: A002  (the word of the command line and of astropy)
+    columns: Mapping[str, str] | None = None,
+    band: str | None = None,
+) -> Catalog:
+    """Main-sequence stars of a catalogue file, with the count of what was left out.
+
+    Parameters
+    ----------
+    path : path
+        Text (UTF-8), FITS or VOTable; also compressed with gzip.
+    format : str, optional
+        A key of `READERS`; where not given, it is recognised from the content.
+    columns : mapping of str to str, optional
+        For ``table``: the file's column of ``mass``, ``distance``, ``magnitude`` and, where there is one,
+        of ``metallicity``, ``log_age``, ``component``, ``luminosity_class``; each by default its own name.
+    band : str, optional
+        Band of the magnitudes wanted; by default the one that the file states, or else ``"i"`` (AB).
+
+    Returns
+    -------
+    catalog : Catalog
+        The stars in internal units (M_sun, pc, mag, dex, log10 yr), and what was rejected or assumed.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read; in one line, with row (line of a text file, row of any other) and column.
+
+    Notes
+    -----
+    A mass of 0 and a magnitude beyond ±50 (99 in most catalogues) or NaN mean that the file has none: the
+    row is rejected and counted.  A mass or distance that is missing, NaN, infinite or negative, and a
+    distance of 0, is an error in any row, on the main sequence or not.
+    """
+    file = open_catalog(Path(path), columns or {}, band)
+    beginning = file.data[:65536]
+    name = format or next((name for name, sign in _SIGNATURES.items() if sign.search(beginning)), "table")
+    if name not in READERS:
+        raise InputError(f"must be one of {', '.join(READERS)}", key="format", value=name)
+    with np.errstate(all="ignore"):  # the file's numbers may overflow or be NaN before they are checked
+        return _select(file.path, name, READERS[name](file))
+
+
+def write_stars(stars: Stars, path: str | os.PathLike[str]) -> None:
+    """A file of stars (ECSV) that `read_catalog` gives back unchanged.
+
+    Parameters
+    ----------
+    stars : Stars
+        The stars; columns carry their units, and band, area (deg²) and source are in the header.
+    path : path
+        The file, replaced if it exists; it is never seen half written.
+
+    Returns
+    -------
+    None
+        The result is the file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    from astropy.table import Table  # noqa: PLC0415  (slow to import, needed for tables only)
+
+    area = None if stars.area is None else float(stars.area)
+    table = Table(meta={"band": stars.band, "area_deg2": area, "source": stars.source})
+    for name, unit in (REQUIRED | OPTIONAL).items():
+        if name != "luminosity_class":  # all are on the main sequence
+            table[name] = getattr(stars, name)
+            table[name].unit = unit or None
+    path = Path(path)
+    try:
+        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        try:
+            with partial.open("x", encoding="utf-8") as stream:
+                table.write(stream, format="ascii.ecsv")
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError("must be writable", source=path, value=error.strerror) from None
+    except ValueError:  # no name at all, or a NUL in it
+        raise InputError("must be the name of a file", source=repr(str(path))) from None
+
+
+def _check(path: Path, rows: CatalogRows) -> None:
+    """Stop at the first row whose mass or distance is none, or whose metallicity or age is infinite."""
+    mass, distance = rows.values["mass"], rows.values["distance"]
+    bad = {
+        "mass": (~(np.isfinite(mass) & (mass >= 0)), "must be positive and finite (0 where unknown)"),
+        "distance": (~(np.isfinite(distance) & (distance > 0)), "must be positive and finite"),
+        **{quantity: (np.isinf(rows.values[quantity]), "must be finite") for quantity in _ASSUMED},
+    }
+    for quantity, (mask, rule) in bad.items():
+        if np.any(mask):
+            refuse(path, rows.row, rows.names[quantity], rows.values[quantity], mask, rule)
+
+
+def _select(path: Path, name: str, rows: CatalogRows) -> Catalog:
+    """Catalogue of the main-sequence stars; the rejected rows are counted by reason."""
+    _check(path, rows)
+    n = rows.row.size
+    reasons = {
+        "not on the main sequence": rows.values.get("luminosity_class", np.full(n, 5.0)) != _MAIN_SEQUENCE,
+        "no mass": rows.values["mass"] == 0,
+        "no magnitude": ~(np.abs(rows.values["magnitude"]) < _NO_MAGNITUDE),
+    }
+    keep = np.ones(n, dtype=bool)
+    rejected = {}
+    for reason, bad in reasons.items():
+        if np.any(keep & bad):
+            rejected[reason] = int(np.count_nonzero(keep & bad))
+        keep &= ~bad
+    if not np.any(keep):
+        rule = "must hold at least one main-sequence star with mass and magnitude"
+        account = ", ".join(f"{count} {reason}" for reason, count in rejected.items())
+        raise InputError(rule, source=path, value=account)
+    return Catalog(
+        stars=_stars(rows, keep, path.name),
+        format=name,
+        n_rows=n,
+        rejected=rejected,
+        assumed=_account(rows, keep),
+        pointing=rows.pointing,
+    )
+
+
+def _stars(rows: CatalogRows, keep: BoolArray, name: str) -> Stars:
+    """Stars of the rows kept, the Sun's metallicity and 5 Gyr where the file gives none."""
+    values = {quantity: rows.values[quantity][keep] for quantity in (*REQUIRED, *_ASSUMED)}
+    for quantity, default in _ASSUMED.items():
+        values[quantity] = np.where(np.isnan(values[quantity]), default, values[quantity])
+    return Stars(
+        **values,
+        component=rows.component[keep],
+        band=rows.band,
+        area=rows.area,
+        source=rows.source or name,
+    )
+
+
+def _account(rows: CatalogRows, keep: BoolArray) -> dict[str, int]:
+    """Count of what was assumed of the rows kept."""
+    masks = {
+        **rows.assumed,
+        **{
+            f"{name} not given, {value} taken": np.isnan(rows.values[name])
+            for name, value in _ASSUMED.items()
+        },
+        "component not given": rows.component == "unknown",
+    }
+    counts = {reason: int(np.count_nonzero(mask & keep)) for reason, mask in masks.items()}
+    return {reason: count for reason, count in counts.items() if count}
+
+
+def _read_table(file: CatalogFile) -> CatalogRows:
+    """Rows of any table with named columns.
+
+    Units are honoured; a bare number is in the internal unit.  ``band``, ``area_deg2`` and ``source`` come
+    from the table's metadata.
+    """
+    wanted = {**REQUIRED, **OPTIONAL}
+    unknown = next((name for name in file.columns if name not in wanted), None)
+    if unknown is not None:
+        raise InputError(f"must be one of {', '.join(wanted)}", key="columns", value=unknown)
+    table, row = load_table(file)
+    names = {quantity: file.columns.get(quantity, quantity) for quantity in wanted}
+    for quantity, name in names.items():
+        if name not in table.colnames and (quantity in REQUIRED or quantity in file.columns):
+            rule = f"must be in the table, for {quantity}; it has {', '.join(table.colnames[:30])}"
+            raise InputError(rule, source=file.path, column=name)
+    if not len(table):
+        raise InputError("must have rows below its header", source=file.path)
+    values = {"metallicity": np.full(len(table), np.nan), "log_age": np.full(len(table), np.nan)}
+    for quantity, unit in wanted.items():
+        if quantity != "component" and names[quantity] in table.colnames:
+            values[quantity] = column_values(file.path, table[names[quantity]], names[quantity], unit, row)
+    component = np.full(len(table), "unknown")
+    if names["component"] in table.colnames:
+        component = _components(file.path, table[names["component"]], names["component"], row)
+    assumed = {}
+    if "luminosity_class" not in values:
+        assumed["luminosity class not given, main sequence taken"] = np.ones(len(table), dtype=bool)
+    return CatalogRows(
+        row=row,
+        names=names,
+        values=values,
+        component=component,
+        assumed=assumed,
+        **_metadata(file, table.meta),
+    )
+
+
+def _metadata(file: CatalogFile, meta: Mapping[Any, Any]) -> dict[str, Any]:
+    """Band, area and source, as the table states them (in capitals in FITS)."""
+    own = {str(key).lower(): value for key, value in meta.items()}
+    band = str(own.get("band") or file.band or "i")
+    if file.band and band != file.band:
+        raise InputError(f"must be {band}, the file's own", source=file.path, key="band", value=file.band)
+    area = own.get("area_deg2")
+    if area is not None and not (isinstance(area, (int, float)) and 0 < area <= SKY_AREA):
+        rule = "must be positive and no more than the sky"
+        raise InputError(rule, source=file.path, key="area_deg2", value=repr(area))
+    return {
+        "band": band,
+        "area": None if area is None else float(area),
+        "source": str(own.get("source") or ""),
+    }
+
+
+def _components(path: Path, column: Any, name: str, row: IntArray) -> NDArray[np.str_]:
+    """Names of components, ``unknown`` where masked or empty."""
+    data = np.ma.asarray(column)
+    if data.ndim != 1:
+        raise InputError("must hold one name in each row", source=path, column=name, value=data.dtype)
+    try:
+        texts = np.char.strip(np.ma.getdata(data).astype(str))
+    except ValueError as error:  # bytes beyond ASCII
+        raise InputError("must hold names", source=path, column=name, value=error) from None
+    component: NDArray[np.str_] = np.where(np.ma.getmaskarray(data) | (texts == ""), "unknown", texts)
+    bad = ~np.isin(component, COMPONENTS)
+    if np.any(bad):
+        k = int(np.argmax(bad))
+        rule = f"must be one of {', '.join(COMPONENTS)}"
+        raise InputError(rule, source=path, row=int(row[k]), column=name, value=component[k])
+    return component
+
+
+READERS: dict[str, Callable[[CatalogFile], CatalogRows]] = {
+    "besancon": read_besancon,
+    "table": _read_table,
+}
+"""Format of a file: its reader."""
+
+_SIGNATURES = {"besancon": BESANCON}  # a file that shows none of these is a table

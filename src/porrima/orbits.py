@@ -49,7 +49,7 @@ def projection_nodes(projection: Projection) -> tuple[FloatArray, FloatArray]:
     The mean square of the factor is 2/3 and 3/4.
     """
     if projection == "isotropic":
-        x, w = np.polynomial.legendre.leggauss(40)
+        x, w = np.polynomial.legendre.leggauss(128)
         t = 0.25 * math.pi * (x + 1)
         return np.cos(t), 0.25 * math.pi * w * np.cos(t)
     s = np.sin(0.5 * math.pi * (np.arange(24) + 0.5) / 24)

@@ -244,7 +244,8 @@ class MainSequence:
     -----
     The table shipped with Porrima holds, for six metallicities [M/H] (-2 to +0.3) and three ages
     (log10 9.0, 9.8, 10.2 yr), absolute magnitudes from 0.09 M_sun to the turn-off.  Between its nodes
-    magnitudes are linear in log10 mass, [M/H] and log10 age; beyond its ends [M/H] and age are clipped.
+    magnitudes are linear in log10 mass, [M/H] and age (the brightening is, nearly); beyond its ends [M/H]
+    and age are clipped.
 
     - A star that its catalogue calls a main-sequence star is not older than the turn-off of its mass
       and metallicity: its age is lowered to that.  Above a track's last mass the track goes on straight.
@@ -299,7 +300,7 @@ class MainSequence:
         grid, turn_off, mh, age = _main_sequence_grid(band)
         j, wj = _bracket(mh, metallicity)
         turn_off_star = (1 - wj)[:, None] * turn_off[j] + wj[:, None] * turn_off[j + 1]
-        k, wk = _bracket(age, np.minimum(log_age, _oldest(turn_off_star, age, mass)))
+        k, wk = _bracket(10.0**age, 10.0 ** np.minimum(log_age, _oldest(turn_off_star, age, mass)))
         first = j * age.size + k
         return Tracks(
             log_mass_min=float(np.log10(self.mass_range[0])),
@@ -308,6 +309,28 @@ class MainSequence:
             index=np.stack([first, first + 1, first + age.size, first + age.size + 1], axis=1),
             weight=np.stack([(1 - wj) * (1 - wk), (1 - wj) * wk, wj * (1 - wk), wj * wk], axis=1),
         )
+
+    def turn_off_mass(self, metallicity: FloatArray, log_age: FloatArray) -> FloatArray:
+        """Largest mass still on the main sequence.
+
+        Parameters
+        ----------
+        metallicity : (n,) float array
+            [M/H], in dex.
+        log_age : (n,) float array
+            log10 of the age in yr.
+
+        Returns
+        -------
+        mass : (n,) float array
+            In M_sun, at most the upper end of `mass_range`, linear in [M/H] and log10 age.
+        """
+        _, turn_off, mh, age = _main_sequence_grid(self.bands[0])
+        (j, wj), (k, wk) = _bracket(mh, metallicity), _bracket(age, log_age)
+        young = (1 - wj) * turn_off[j, k] + wj * turn_off[j + 1, k]
+        old = (1 - wj) * turn_off[j, k + 1] + wj * turn_off[j + 1, k + 1]
+        mass: FloatArray = (1 - wk) * young + wk * old
+        return mass
 
 
 PHOTOMETRY: dict[str, MassLuminosity] = {

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.interpolate import CubicSpline
+from scipy.special import log_ndtr, logsumexp
 
 from porrima.moments import INDICES, N_MOMENTS, ORDER, angular_mean, pair_coefficient
 from porrima.orbits import projection_nodes
@@ -34,6 +35,7 @@ _EVEN = tuple(range(2, ORDER + 1, 2))
 _PRODUCTS = tuple((n, m) for n in range(2, ORDER + 1) for m in range(n, ORDER + 1) if (n + m) % 2 == 0)
 _CHUNK = 4096  # stars integrated at a time
 _MASS_RATIO_PANELS = 48
+_DISTANCE_STEP = 0.004  # dex
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,41 +143,64 @@ def integrate(population: Population) -> PairIntegrals:
     :math:`E[a^k; a < A] = \exp(k\mu + k^2 s^2/2)\, \Phi((\ln A - \mu)/s - k s)`.
     Mass ratio and separation are independent in the models at hand.
     """
-    parts = [
-        _integrate_some(population, slice(first, first + _CHUNK))
-        for first in range(0, len(population.stars), _CHUNK)
-    ]
+    separations = _separation_moments(population)
+    c_mean, c_product = (
+        np.concatenate(parts)
+        for parts in zip(
+            *(
+                _coefficient_moments(population, slice(first, first + _CHUNK))
+                for first in range(0, len(population.stars), _CHUNK)
+            ),
+            strict=True,
+        )
+    )
     return PairIntegrals(
-        unresolved=np.concatenate([p.unresolved for p in parts]),
-        mean=np.concatenate([p.mean for p in parts]),
-        product=np.concatenate([p.product for p in parts]),
+        unresolved=separations[0],
+        mean=c_mean * np.stack([separations[n] for n in _EVEN], axis=1),
+        product=c_product * np.stack([separations[n + m] for n, m in _PRODUCTS], axis=1),
     )
 
 
-def _integrate_some(population: Population, some: slice) -> PairIntegrals:
-    separations = _separation_moments(population, some)
+def _coefficient_moments(population: Population, some: slice) -> tuple[FloatArray, FloatArray]:
+    """E[c_n] for even n, and E[c_n c_m], of some stars."""
     f, weight = _flux_ratio_nodes(population, some)
     c = {n: pair_coefficient(f, n) for n in range(2, ORDER + 1)}
-    mean = [np.sum(weight * c[n], axis=1) * separations[n] for n in _EVEN]
-    product = [np.sum(weight * c[n] * c[m], axis=1) * separations[n + m] for n, m in _PRODUCTS]
-    return PairIntegrals(
-        unresolved=separations[0], mean=np.stack(mean, axis=1), product=np.stack(product, axis=1)
-    )
+    mean = [np.sum(weight * c[n], axis=1) for n in _EVEN]
+    product = [np.sum(weight * c[n] * c[m], axis=1) for n, m in _PRODUCTS]
+    return np.stack(mean, axis=1), np.stack(product, axis=1)
 
 
-def _separation_moments(population: Population, some: slice) -> dict[int, FloatArray]:
-    """E[r^k; r < cut] of some stars for even k from 0 to twice the order, in arcsec^k."""
-    law = population.law
+def _separation_moments(population: Population) -> dict[int, FloatArray]:
+    """E[r^k; r < cut] of each star for even k from 0 to twice the order, in arcsec^k.
+
+    They depend on the star through its law and distance alone, so they are found on a fine grid of distances
+    and interpolated (cubic, in logarithms).
+    """
+    law = np.stack([population.law.log_a, population.law.log_a_sigma, population.law.log_a_max], axis=1)
+    log_distance = np.log10(population.stars.distance)
+    n = max(5, 2 + int(np.ptp(log_distance) / _DISTANCE_STEP))
+    grid = np.linspace(log_distance.min() - _DISTANCE_STEP, log_distance.max() + _DISTANCE_STEP, n)
+    moments = {k: np.empty(log_distance.size) for k in range(0, 2 * ORDER + 1, 2)}
+    laws, which = np.unique(law, axis=0, return_inverse=True)
+    for number, one in enumerate(laws):
+        mine = which.ravel() == number
+        for k, log_moment in _log_separation_moments(population, one, grid).items():
+            moments[k][mine] = np.exp(CubicSpline(grid, log_moment)(log_distance[mine]))
+    return moments
+
+
+def _log_separation_moments(population: Population, law: FloatArray, log_distance: FloatArray) -> dict[int, FloatArray]:
+    """Log of E[r^k; r < cut] for one law of the semi-major axis at each log10 distance."""
     rho, weight = projection_nodes(population.projection)
-    mu, s, largest = (v[some, None] * math.log(10) for v in (law.log_a, law.log_a_sigma, law.log_a_max))
-    log_distance = np.log(population.stars.distance[some, None])
-    upper = np.minimum(math.log(population.cut) + log_distance - np.log(rho), largest)
+    mu, s, largest = law * math.log(10)
+    log_d = log_distance[:, None] * math.log(10)
+    upper = np.minimum(math.log(population.cut) + log_d - np.log(rho), largest)
     z = (upper - mu) / s
     log_norm = log_ndtr((largest - mu) / s)
     moments = {}
     for k in range(0, 2 * ORDER + 1, 2):
-        log_partial = k * (mu - log_distance + np.log(rho)) + 0.5 * (k * s) ** 2 + log_ndtr(z - k * s) - log_norm
-        moments[k] = np.exp(log_partial) @ weight
+        log_partial = k * (mu - log_d + np.log(rho)) + 0.5 * (k * s) ** 2 + log_ndtr(z - k * s) - log_norm
+        moments[k] = logsumexp(log_partial, axis=1, b=weight)
     return moments
 
 

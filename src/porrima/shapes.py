@@ -27,13 +27,13 @@ HSM_PARAMS = galsim.hsm.HSMParams(convergence_threshold=PRECISION, max_amoment=1
 """HSM cuts its weight where it falls below a tenth of ``convergence_threshold``; its default limits on
 size and shift are meant for survey pixels, not for a grid 12 times finer."""
 
-POLISH_TOLERANCE = 1e-13
-"""Change of the weight, as a fraction of its size, at which float64 has nothing left to give."""
+POLISH_TOLERANCE = 1e-12
+"""Change of the weight, as a fraction of its size, at which an iteration in float64 stops (dimensionless)."""
 
 MAX_ITERATIONS = 200
 
 SIGMA_MIN = 0.02
-"""Narrowest fixed weight, in arcsec: 2.4 pixels of the coarsest grid, where pixel sums are still integrals."""
+"""Narrowest fixed weight, in arcsec: 2.4 pixels of the coarsest grid: pixel sums are still integrals."""
 
 
 class Failure(IntFlag):
@@ -119,6 +119,8 @@ class Estimator(Protocol):
     def measure(self, image: Any) -> Shape:
         """Shape of one image, as a `Shape` of 0-d arrays."""
         ...
+
+    def __hash__(self) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +246,9 @@ class Adaptive:
         failure = _pixels_failure(image)
         if failure:
             return _failed(failure)
-        sigma = math.sqrt(image.array.sum() / (2 * math.pi * image.array.max()))  # of a Gaussian that peaks so
+        sigma = math.sqrt(
+            image.array.sum() / (2 * math.pi * image.array.max())
+        )  # of a Gaussian that peaks so
         found = galsim.hsm.FindAdaptiveMom(
             image, guess_sig=sigma, precision=PRECISION, hsmparams=HSM_PARAMS, strict=False
         )
@@ -254,7 +258,9 @@ class Adaptive:
         half = (found.moments_sigma * image.scale) ** 2 / math.sqrt(1 - e1**2 - e2**2)
         centre = np.array([found.moments_centroid.x, found.moments_centroid.y])
         middle = np.array([image.true_center.x, image.true_center.y])
-        return _polished(image, (centre - middle) * image.scale, half * np.array([[1 + e1, e2], [e2, 1 - e1]]))
+        return _polished(
+            image, (centre - middle) * image.scale, half * np.array([[1 + e1, e2], [e2, 1 - e1]])
+        )
 
 
 def _polished(image: Any, centre: FloatArray, weight: FloatArray) -> Shape:
@@ -326,11 +332,11 @@ class GaussianWeight:
             moments = _weighted_moments(image, centre, weight)
             if not moments.flux > 0:
                 return _failed(Failure.NO_FLUX)
+            slope = np.eye(2) - moments.covariance / self.sigma**2
+            if not (np.trace(slope) > 0 and np.linalg.det(slope) > 0):
+                break  # between two sources: the centroid would run away from the centre
             if np.abs(moments.offset).max() < POLISH_TOLERANCE * self.sigma:
                 return _shape(moments.covariance)
-            slope = np.eye(2) - moments.covariance / self.sigma**2
-            if not np.linalg.det(slope) > 0:
-                break
             centre = centre + np.linalg.solve(slope, moments.offset)
         return _failed(Failure.NOT_CONVERGED)
 

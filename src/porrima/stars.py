@@ -184,3 +184,38 @@ class Stars:
         if component is not None:
             keep &= self.component == component
         return self.take(keep)
+
+    def counts(self, magnitude: tuple[float, float], multiplicity_fraction: FloatArray) -> list[dict[str, Any]]:
+        """Number and mean properties of the stars per magnitude.
+
+        Parameters
+        ----------
+        magnitude : (float, float)
+            Range to divide into bins of one mag from its bright end; the last may be narrower.
+        multiplicity_fraction : (n,) float array
+            Of each star, in [0, 1].
+
+        Returns
+        -------
+        counts : list of dict
+            ``mag_lo``, ``mag_hi``, ``n``, ``n_per_deg2``, ``median_distance_pc``, ``mean_mass`` [M_sun] and
+            ``mean_multiplicity_fraction``; None where not known or there is no star.
+        """
+        low, high = magnitude
+        edges = np.append(np.arange(low, high, 1.0), high)
+        rows = []
+        for lo, hi in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+            inside = (self.magnitude >= lo) & (self.magnitude < hi)
+            n = int(inside.sum())
+            rows.append(
+                {
+                    "mag_lo": lo,
+                    "mag_hi": hi,
+                    "n": n,
+                    "n_per_deg2": n / self.area if self.area else None,
+                    "median_distance_pc": float(np.median(self.distance[inside])) if n else None,
+                    "mean_mass": float(self.mass[inside].mean()) if n else None,
+                    "mean_multiplicity_fraction": float(multiplicity_fraction[inside].mean()) if n else None,
+                }
+            )
+        return rows

@@ -23,9 +23,9 @@ def philox(key_low, key_high, c0, c1, c2, c3):  # type: ignore[no-untyped-def]
         p0 = uint64(0xD2511F53) * uint64(x0)
         p1 = uint64(0xCD9E8D57) * uint64(x2)
         x0, x1, x2, x3 = (
-            uint32(p1 >> uint64(32)) ^ x1 ^ k0,
+            uint32(uint32(p1 >> uint64(32)) ^ x1 ^ k0),
             uint32(p1),
-            uint32(p0 >> uint64(32)) ^ x3 ^ k1,
+            uint32(uint32(p0 >> uint64(32)) ^ x3 ^ k1),
             uint32(p0),
         )
         k0 = uint32(k0 + uint32(0x9E3779B9))
@@ -41,9 +41,9 @@ def uniform(word):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def uniform_pair(high, low):  # type: ignore[no-untyped-def]
-    """Number in (0, 1) with 53 random bits from two 32-bit words."""
-    bits = (uint64(high) << uint64(21)) | (uint64(low) >> uint64(11))
-    return (bits + 0.5) * 1.1102230246251565e-16
+    """Number in (0, 1), never either end, with 52 random bits from two 32-bit words."""
+    bits = (uint64(high) << uint64(20)) | (uint64(low) >> uint64(12))
+    return (bits + 0.5) * 2.220446049250313e-16
 
 
 @njit(inline="always")

@@ -1,0 +1,374 @@
+"""The commands: arguments in, one result out; no science here, and heavy imports only where used."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from typer.exceptions import TyperException
+
+from porrima.errors import InputError
+
+if TYPE_CHECKING:
+    from porrima.config import PopulationConfig
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    help="What unresolved binary stars do to the PSF of a weak-lensing survey.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+Seed = Annotated[int, typer.Option("--seed", help="Of everything that is drawn.")]
+Longitude = Annotated[float | None, typer.Option("--l", help="Galactic longitude [deg].")]
+Latitude = Annotated[float | None, typer.Option("--b", help="Galactic latitude [deg].")]
+Catalogue = Annotated[Path | None, typer.Option("--catalog", help="A real catalogue instead of the analytic Galaxy.")]
+Format = Annotated[str | None, typer.Option("--format", help="Of the catalogue; recognised when not given.")]
+Mapping = Annotated[str | None, typer.Option("--map", help="Its columns: mass=M,distance=D,magnitude=I.")]
+Band = Annotated[str | None, typer.Option("--band", help="Of the magnitudes; i, or the catalogue's own.")]
+Mag = Annotated[tuple[float, float], typer.Option("--mag", help="Magnitude range [lo, hi).", metavar="LO HI")]
+MultiplicityName = Annotated[str, typer.Option("--multiplicity", help="dk13 or dk13-kcm16.")]
+PhotometryName = Annotated[str, typer.Option("--photometry", help="main-sequence or habets-heintze.")]
+Psf = Annotated[str, typer.Option("--psf", help="Name of the PSF.")]
+EstimatorName = Annotated[str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")]
+
+
+@app.command()
+def stars(
+    *,
+    l: Longitude = None,  # noqa: E741  (Galactic longitude)
+    b: Latitude = None,
+    area: Annotated[float, typer.Option(help="Solid angle to fill [deg²].")] = 1.0,
+    catalog: Catalogue = None,
+    format: Format = None,  # noqa: A002
+    map: Mapping = None,  # noqa: A002
+    band: Band = None,
+    mag: Mag = (16.0, 24.0),
+    multiplicity: MultiplicityName = "dk13",
+    seed: Seed = 1,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Stars of the analytic Galaxy, or of a real catalogue, selected and counted."""
+    from porrima.catalogs import write_stars
+    from porrima.simulation import draw_stars
+
+    config = _population_config(
+        l=l, b=b, catalog=catalog, format=format, map=map, band=band, mag=mag, seed=seed,
+        multiplicity=multiplicity, area=area if catalog is None else None,
+    )  # fmt: skip
+    selected = draw_stars(config)
+    law = config.multiplicity.build().companions(selected.mass)
+    counts = selected.counts(mag, law.multiplicity_fraction)
+    if output is not None:
+        write_stars(selected, output)
+    result = {"n": len(selected), "area_deg2": selected.area, "counts": counts}
+    table = [[f"{c['mag_lo']:g}-{c['mag_hi']:g}", *list(c.values())[2:]] for c in counts]
+    _show(
+        result,
+        as_json,
+        f"{len(selected)} stars, {selected.source}",
+        [selected.band, "stars", "per deg²", "median distance [pc]", "mean mass [M_sun]", "multiplicity fraction"],
+        table,
+    )
+
+
+@app.command()
+def measure(
+    table: Annotated[Path, typer.Argument(help="Columns flux_ratio, dx, dy [arcsec] and, optionally, weight.")],
+    psf: Psf,
+    estimator: EstimatorName = "adaptive",
+    method: Annotated[Literal["response", "images"], typer.Option(help="Moments, or GalSim images.")] = "response",
+    as_json: Json = False,
+) -> None:
+    """Shape of one stack of the pairs in a table, and its change against the PSF without companions."""
+    from porrima.io import read_systems
+    from porrima.psf import psf_from_name
+    from porrima.shapes import estimator_from_name
+
+    systems = read_systems(table)
+    result = _measured(systems, psf_from_name(psf), estimator_from_name(estimator), method)
+    header = f"{len(systems)} systems, {psf}, {estimator}, {method}"
+    _show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
+
+
+@app.command()
+def predict(
+    *,
+    stars: Annotated[Path | None, typer.Option("--stars", help="Table as `porrima stars` writes it.")] = None,
+    catalog: Catalogue = None,
+    format: Format = None,  # noqa: A002
+    map: Mapping = None,  # noqa: A002
+    l: Longitude = None,  # noqa: E741
+    b: Latitude = None,
+    mag: Mag,
+    psf: Psf,
+    estimator: EstimatorName = "adaptive",
+    binary_fraction: Annotated[float | None, typer.Option(help="0 to 1; as the model gives it if not given.")] = None,
+    n_stars: Annotated[int | None, typer.Option(help="In the stack; infinitely many if not given.")] = None,
+    multiplicity: MultiplicityName = "dk13",
+    photometry: PhotometryName = "main-sequence",
+    band: Band = None,
+    cut: Annotated[float, typer.Option(help="Separation from which a pair is resolved [arcsec].")] = 0.05,
+    seed: Seed = 1,
+    as_json: Json = False,
+) -> None:
+    """Bias and error of the PSF's shape in closed form."""
+    import numpy as np
+
+    from porrima.prediction import QUANTITIES, integrate, population_moments
+    from porrima.prediction import predict as predicted
+    from porrima.psf import psf_from_name
+    from porrima.response import response
+    from porrima.shapes import estimator_from_name
+    from porrima.simulation import draw_stars, population_of
+
+    if stars is not None and catalog is not None:
+        raise InputError("cannot be given together with --catalog", key="--stars", value=stars)
+    if stars is not None:
+        catalog, format = stars, "table"  # noqa: A001
+    if binary_fraction is not None and not 0 <= binary_fraction <= 1:
+        raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
+    if n_stars is not None and n_stars < 1:
+        raise InputError("must be at least 1", key="--n-stars", value=n_stars)
+    config = _population_config(
+        l=l, b=b, catalog=catalog, format=format, map=map, band=band, mag=mag, seed=seed,
+        multiplicity=multiplicity, photometry=photometry, cut=cut,
+    )  # fmt: skip
+    reply = response(psf_from_name(psf), estimator_from_name(estimator))
+    population = population_of(config, draw_stars(config))
+    fraction = None if binary_fraction is None else np.array([binary_fraction])
+    moments = population_moments(population, integrate(population), fraction)
+    prediction = predicted(moments, reply, n_stars)
+    result: dict[str, Any] = {
+        "mean_x": moments.mean_x[0],
+        "mean_x2": moments.mean_x2[0],
+        "eta": prediction.eta[0],
+    }
+    for name in ("bias", "sigma", "sd"):
+        result |= {f"{name}_{q}": v for q, v in zip(QUANTITIES, getattr(prediction, name)[:, 0], strict=True)}
+    result |= {
+        "n_stars": n_stars,
+        "binary_fraction": binary_fraction,
+        "population_binary_fraction": moments.binary_fraction[0],
+        "unresolved_fraction": moments.unresolved_fraction[0],
+        "removed_fraction": moments.removed_fraction[0],
+        "n_catalog_stars": len(population.stars),
+    }
+    header = f"{len(population.stars)} stars, {psf}, {estimator}, {multiplicity}"
+    _show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
+
+
+@app.command()
+def simulate(
+    config: Annotated[Path | None, typer.Argument(help="YAML file; see --example.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Zarr store to make.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    method: Annotated[Literal["moments", "images"], typer.Option(help="Moments, or GalSim images.")] = "moments",
+    chunk: Annotated[int, typer.Option(help="Stacks per chunk.", min=1)] = 10_000,
+    seed: Annotated[int | None, typer.Option("--seed", help="Instead of that of the configuration.")] = None,
+    example: Annotated[bool, typer.Option("--example", help="Print a configuration.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Many stacks of stars, some with companions: their kernel moments and shapes."""
+    from porrima.config import EXAMPLE, RunConfig, load, parse
+
+    if example:
+        typer.echo(EXAMPLE, nl=False)
+        return
+    if config is None:
+        raise InputError("is missing", key="CONFIG.yaml")
+    if output is None:
+        raise InputError("is missing", key="--output")
+    run = load(config)
+    if seed is not None:
+        run = parse(RunConfig, run.model_dump() | {"seed": seed})
+    from porrima.simulation import simulate as simulated
+
+    start = time.perf_counter()
+    with _Progress(run.n_stacks, "stacks") as progress:
+        done = simulated(run, output, resume=resume, method=method, chunk=chunk, progress=progress.advance)
+    wall = time.perf_counter() - start
+    result = {
+        "n_stacks": run.n_stacks,
+        "n_stars": run.n_stars,
+        "wall_s": wall,
+        "stars_per_s": done * run.n_stars / wall,
+        "n_stacks_computed": done,
+    }
+    header = f"{output}: {run.n_stacks} stacks of {run.n_stars} stars"
+    _show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
+
+
+@app.command()
+def summary(
+    run: Annotated[Path, typer.Argument(help="Zarr store of a run.", metavar="RUN.zarr")],
+    bins: Annotated[int, typer.Option(help="Ranges of binary fraction.")] = 20,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Bias and error per range of binary fraction, with standard errors and predictions."""
+    from porrima.io import write_rows
+    from porrima.simulation import open_run
+    from porrima.summary import rows, summarise
+
+    if bins < 1:
+        raise InputError("must be at least 1", key="--bins", value=bins)
+    result = rows(summarise(*open_run(run), bins=bins))
+    if output is not None:
+        write_rows(result, output)
+    keys = list(result[0]) if result else []
+    _show({"bins": result}, as_json, str(run), keys, [list(row.values()) for row in result])
+
+
+@app.command()
+def paper(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for figures, tables and the report.")],
+    full: Annotated[bool, typer.Option("--full", help="At the paper's own number of stacks.")] = False,
+    seed: Seed = 1,
+    as_json: Json = False,
+) -> None:
+    """The paper's figure of errors and biases against binary fraction, with its numbers."""
+    from porrima.experiments import errors_and_biases, paper_config
+    from porrima.io import make_folder
+    from porrima.report import write_report
+
+    config = paper_config(full=full, seed=seed)
+    make_folder(output)
+    start = time.perf_counter()
+    with _Progress(config.n_stacks, "stacks") as progress:
+        numbers = errors_and_biases(config, output / f"run-{config.n_stacks}-{seed}.zarr", progress.advance)
+    report = write_report(numbers, output)
+    result = {
+        "report": str(report),
+        "n_stacks": config.n_stacks,
+        "n_stars": config.n_stars,
+        "wall_s": time.perf_counter() - start,
+    }
+    _show(result, as_json, f"report: {report}", ["quantity", "value"], [[k, v] for k, v in result.items()])
+
+
+def main() -> None:
+    """Run a command; wrong input ends in one line and exit code 2.
+
+    Returns
+    -------
+    None
+        The process exits.
+    """
+    arguments = sys.argv[1:] or ["--help"]
+    try:
+        code = typer.main.get_command(app).main(arguments, prog_name="porrima", standalone_mode=False)
+    except InputError as error:
+        code = _fail(str(error), 2)
+    except TyperException as error:
+        code = _fail(error.format_message(), 2)
+    except (KeyboardInterrupt, typer.Abort):
+        code = _fail("interrupted", 1)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def _population_config(**options: Any) -> PopulationConfig:
+    """Configuration from the options of a command, checked by the same rules as a file."""
+    from porrima.config import PopulationConfig, parse
+
+    where = ("l", "b", "catalog", "format", "map", "band", "mag", "area")
+    columns = options.get("map")
+    if columns is not None:
+        parts = [part.split("=") for part in columns.split(",")]
+        if any(len(part) != 2 or not all(part) for part in parts):
+            raise InputError("must be column=name,column=name", key="--map", value=columns)
+        options["map"] = dict(parts)
+    given = {key: value for key, value in options.items() if value is not None}
+    stars = {key: value for key, value in given.items() if key in where}
+    rest = {key: value for key, value in given.items() if key not in where}
+    return parse(PopulationConfig, {"stars": stars} | rest)
+
+
+def _measured(systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, float]:
+    """Shape of a stack and its change, as `measure` shows it."""
+    import numpy as np
+
+    from porrima.images import measure_stack
+    from porrima.response import response
+    from porrima.systems import Systems
+
+    zero = np.zeros(1)
+    alone = Systems.from_pairs(zero, zero, zero)
+
+    def shape(of: Systems) -> Any:
+        if method == "images":
+            return measure_stack(psf, of, estimator)
+        return response(psf, estimator).shapes(of.kernel_moments())
+
+    stack, single = ({q: float(np.squeeze(getattr(shape(s), q))) for q in ("e1", "e2", "r2")} for s in (systems, alone))
+    return stack | {f"{q}_0": v for q, v in single.items()} | {
+        "de1": stack["e1"] - single["e1"],
+        "de2": stack["e2"] - single["e2"],
+        "dr2_rel": stack["r2"] / single["r2"] - 1,
+    }
+
+
+class _Progress:
+    """A bar on standard error, with the rate and the time left."""
+
+    def __init__(self, total: int, unit: str) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        self._bar = Progress(
+            BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn(), console=Console(stderr=True)
+        )
+        self._task = self._bar.add_task(unit, total=total)
+
+    def advance(self, n: int) -> None:
+        self._bar.update(self._task, advance=n)
+
+    def __enter__(self) -> _Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+
+def _show(result: dict[str, Any], as_json: bool, header: str, columns: list[str], table: list[list[Any]]) -> None:
+    """Print a result: one JSON object, or a header and a table."""
+    if as_json:
+        print(json.dumps(_plain(result), allow_nan=False))
+        return
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    grid = Table(*columns, box=box.SIMPLE_HEAD)
+    for row in table:
+        grid.add_row(*(f"{value:.6g}" if isinstance(value, float) else str(value) for value in row))
+    console = Console(width=None if sys.stdout.isatty() else 200)
+    console.print(header, markup=False, highlight=False)
+    console.print(grid)
+
+
+def _plain(value: Any) -> Any:
+    """A result as JSON has it: no numpy types, null for what is not a finite number."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value

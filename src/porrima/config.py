@@ -1,0 +1,299 @@
+"""The configuration of a run: validated YAML, every error naming its key."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from porrima.errors import InputError
+
+__all__ = ["EXAMPLE", "Multiplicity", "PopulationConfig", "RunConfig", "StarsConfig", "load", "parse"]
+
+Model = TypeVar("Model", bound=BaseModel)
+
+EXAMPLE = """\
+stars: {l: 180, b: 45, band: i, mag: [18, 19]}     # or {catalog: FILE, format: besancon, mag: [18, 19]}
+multiplicity: dk13                                  # or {model: dk13, gap_rule: solar, a_max_factor: 2.5, ...}
+photometry: main-sequence                           # or habets-heintze, {model: habets-heintze, branch: primary}
+cut: 0.05                                           # arcsec
+psf: [psf0, psf1, psf2]
+estimator: adaptive                                 # or plain, gaussian:0.75
+n_stars: 40
+n_stacks: 100000
+binary_fraction: uniform                            # uniform (0 to 1, one value per stack), model, or a number
+seed: 1
+"""
+"""What ``porrima simulate --example`` prints."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StarsConfig(_Strict):
+    """Where the stars come from: the analytic Galaxy in a direction, or a catalogue."""
+
+    l: float | None = Field(default=None, ge=0, lt=360)  # noqa: E741  (Galactic longitude, deg)
+    b: float | None = Field(default=None, ge=-90, le=90)  # Galactic latitude, deg
+    n_drawn: int = Field(default=20_000, ge=1)  # stars drawn from the Galaxy in the magnitude range
+    area: float | None = Field(default=None, gt=0, le=41253)  # deg²: a Poisson number of stars fills it instead
+    catalog: Path | None = None
+    format: str | None = None
+    map: dict[str, str] | None = None  # Porrima's column: the file's column
+    band: str | None = None  # i, or the catalogue's own
+    mag: tuple[float, float]
+
+    @model_validator(mode="after")
+    def _one_source(self) -> StarsConfig:
+        direction = self.l is not None and self.b is not None
+        if direction == (self.catalog is not None) or (self.l is None) != (self.b is None):
+            raise ValueError("must have either l and b, or catalog")
+        if not self.mag[0] < self.mag[1]:
+            raise ValueError(f"mag must be [lo, hi) with lo < hi, got {list(self.mag)}")
+        return self
+
+
+class Multiplicity(_Strict):
+    """A named multiplicity model with any of its options changed."""
+
+    model: str = "dk13"
+    gap_rule: Literal["lower", "solar"] | None = None
+    a_max_factor: float | None = Field(default=None, gt=0)
+    scatter_scale: float | None = Field(default=None, gt=0)
+    projection: Literal["isotropic", "inclination-uniform"] | None = None
+    mass_ratio_min: float | None = Field(default=None, gt=0, lt=1)
+
+    def build(self) -> Any:
+        """The model itself.
+
+        Returns
+        -------
+        model : MultiplicityModel
+            The named one with the options given.
+
+        Raises
+        ------
+        InputError
+            If no model has that name.
+        """
+        from porrima.multiplicity import MULTIPLICITY  # noqa: PLC0415  (compiled code, where used)
+
+        named = known("multiplicity", self.model, MULTIPLICITY)
+        options = self.model_dump(exclude={"model"}, exclude_unset=True)
+        return dataclasses.replace(named, **options)
+
+
+class Photometry(_Strict):
+    """A named mass-luminosity relation with any of its options changed."""
+
+    model: str = "main-sequence"
+    branch: Literal["own", "primary"] | None = None
+
+    def build(self) -> Any:
+        """The relation itself.
+
+        Returns
+        -------
+        relation : MassLuminosity
+            The named one with the options given.
+
+        Raises
+        ------
+        InputError
+            If no relation has that name, or it has no such option.
+        """
+        from porrima.photometry import PHOTOMETRY, HabetsHeintze1981  # noqa: PLC0415  (compiled code)
+
+        named = known("photometry", self.model, PHOTOMETRY)
+        if self.branch is None:
+            return named
+        if not isinstance(named, HabetsHeintze1981):
+            raise InputError("is an option of habets-heintze only", key="photometry.branch", value=self.branch)
+        return dataclasses.replace(named, branch=self.branch)
+
+
+class PopulationConfig(_Strict):
+    """Stars, companions and what is resolved."""
+
+    stars: StarsConfig
+    multiplicity: Multiplicity = Multiplicity()
+    photometry: Photometry = Photometry()
+    cut: float = Field(default=0.05, gt=0, allow_inf_nan=False)
+    seed: int = Field(default=1, ge=0, lt=2**64)
+
+    @field_validator("multiplicity", "photometry", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        return {"model": value} if isinstance(value, str) else value
+
+
+class RunConfig(PopulationConfig):
+    """A whole run of `porrima simulate`."""
+
+    psf: tuple[str, ...] = Field(default=("psf0", "psf1", "psf2"), min_length=1)
+    estimator: str = "adaptive"
+    n_stars: int = Field(default=40, ge=1)
+    n_stacks: int = Field(default=100_000, ge=1)
+    binary_fraction: float | Literal["uniform", "model"] = "uniform"
+
+    @field_validator("psf", mode="before")
+    @classmethod
+    def _one_or_more(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, str) else value
+
+    @field_validator("psf")
+    @classmethod
+    def _distinct(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(value)) < len(value):
+            raise ValueError(f"must name each PSF once, got {', '.join(value)}")
+        return value
+
+    @field_validator("binary_fraction", mode="before")
+    @classmethod
+    def _fraction(cls, value: Any) -> Any:
+        if value in ("uniform", "model"):
+            return value
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not 0 <= value <= 1:
+            raise ValueError(f"must be in [0, 1], uniform or model, got {value}")
+        return float(value)
+
+
+def known(key: str, name: str, choices: Any) -> Any:
+    """The value of a name in a visible dict of models.
+
+    Parameters
+    ----------
+    key : str
+        Key or option that the name was given for.
+    name : str
+        The name.
+    choices : dict
+        Names and models.
+
+    Returns
+    -------
+    value : object
+        ``choices[name]``.
+
+    Raises
+    ------
+    InputError
+        If the name is not there; the nearest one is suggested.
+    """
+    if name not in choices:
+        near = difflib.get_close_matches(str(name), list(choices), n=1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        raise InputError(f"must be one of {', '.join(choices)}{hint}", key=key, value=name)
+    return choices[name]
+
+
+def load(path: Path) -> RunConfig:
+    """Configuration read from a YAML file.
+
+    Parameters
+    ----------
+    path : Path
+        The file; a relative ``catalog`` in it is relative to its folder.
+
+    Returns
+    -------
+    config : RunConfig
+        Validated.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, is not YAML, or a key or value in it is wrong.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", source=path) from None
+    except UnicodeDecodeError:
+        raise InputError("must be a UTF-8 text file", source=path) from None
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        row = mark.line + 1 if mark else None
+        raise InputError(f"is not YAML ({getattr(error, 'problem', error)})", source=path, row=row) from None
+    if not isinstance(data, dict):
+        raise InputError("must hold keys and values", source=path, value=type(data).__name__)
+    config = parse(RunConfig, data, source=path)
+    if config.stars.catalog is not None:
+        stars = config.stars.model_copy(update={"catalog": path.parent / config.stars.catalog})
+        config = config.model_copy(update={"stars": stars})
+    return config
+
+
+def parse(model: type[Model], data: Any, source: Path | None = None) -> Model:
+    """Validated configuration.
+
+    Parameters
+    ----------
+    model : type
+        `RunConfig` or another model of this module.
+    data : dict
+        Keys and values.
+    source : Path, optional
+        File they come from, for messages.
+
+    Returns
+    -------
+    config : model
+        Validated, frozen.
+
+    Raises
+    ------
+    InputError
+        For the first key that is wrong: its dotted name, the rule and the value.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as failure:
+        error = failure.errors(include_url=False)[0]
+        location = [str(part) for part in error["loc"]]
+        key = ".".join(location) or None
+        if error["type"] == "extra_forbidden":
+            near = difflib.get_close_matches(location[-1], _keys(model, location[:-1]), n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise InputError(f"is not a key{hint}", source=source, key=key) from None
+        if error["type"] == "missing":
+            raise InputError("is missing", source=source, key=key) from None
+        if error["type"] == "value_error":
+            raise InputError(error["msg"].removeprefix("Value error, "), source=source, key=key) from None
+        rule = error["msg"].replace("Input should be", "must be")
+        raise InputError(rule, source=source, key=key, value=error["input"]) from None
+
+
+def canonical(config: BaseModel) -> str:
+    """One line of JSON with sorted keys that identifies a configuration.
+
+    Parameters
+    ----------
+    config : BaseModel
+        Any configuration.
+
+    Returns
+    -------
+    text : str
+        The same for equal configurations.
+    """
+    return json.dumps(config.model_dump(mode="json", exclude_none=True), sort_keys=True)
+
+
+def _keys(model: type[BaseModel], location: list[str]) -> list[str]:
+    """Names of the keys at a place inside a model."""
+    for part in location:
+        inner = model.model_fields[part].annotation if part in model.model_fields else None
+        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+            return []
+        model = inner
+    return list(model.model_fields)

@@ -1,0 +1,153 @@
+"""The report: one page that needs no network, and the figure and table beside it, from saved numbers only."""
+
+from __future__ import annotations
+
+import io
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from porrima import __version__
+from porrima.figures import errors_and_biases
+from porrima.instruments import KCM16
+from porrima.io import write_rows, write_whole
+from porrima.summary import rows
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+    from porrima.experiments import ErrorsAndBiases
+
+__all__ = ["write_report"]
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Porrima: errors and biases of the PSF from unresolved binary stars</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #1b1b1b;
+  background: #fff; }}
+figure {{ margin: 1.5rem 0; }} figure svg {{ max-width: 100%; height: auto; background: #fff; }}
+.wide {{ overflow-x: auto; }}
+table {{ border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }}
+th, td {{ padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap; }}
+caption {{ text-align: left; padding-bottom: 0.4rem; }}
+pre {{ background: #f4f4f4; padding: 0.8rem; white-space: pre-wrap; overflow-wrap: anywhere; }}
+</style>
+</head>
+<body>
+<main>
+<h1>Errors and biases of the PSF from unresolved binary stars</h1>
+<p>{answer}</p>
+<figure>
+{figure}
+<figcaption>Error (left) and bias (right) of the size and the two ellipticity components of a stack of {n_stars} stars,
+{mag} mag in {band}, against the binary fraction of the population, after Kuntzer, Courbin &amp; Meylan (2016), Fig. 4.
+Symbols: {n_stacks} simulated stacks with standard errors; the PSFs are set apart a little. Solid: closed form for
+{n_stars} stars. Dashed: closed form for infinitely many stars. Dotted: requirement of {requirement}.</figcaption>
+</figure>
+<h2>Simulation against prediction</h2>
+<p>{agreement}</p>
+<div class="wide">{table}</div>
+<p>The whole table is in <code>errors_and_biases.ecsv</code>, the stacks in the Zarr store beside it.</p>
+<h2>How it was made</h2>
+<p>Stars: {stars}. {pairs}</p>
+<pre>{config}</pre>
+<p>Porrima {version}. Models: Kuntzer, Courbin &amp; Meylan 2016 (arXiv:1512.01549); Duch&ecirc;ne &amp; Kraus 2013;
+Robin et al. 2003; Bressan et al. 2012.</p>
+</main>
+</body>
+</html>
+"""
+
+
+def write_report(numbers: ErrorsAndBiases, folder: Path) -> Path:
+    """Path of the page written, with the figure (SVG, PDF, PNG) and the table (ECSV) beside it.
+
+    Parameters
+    ----------
+    numbers : ErrorsAndBiases
+        From `experiments.errors_and_biases`.
+    folder : Path
+        Where to write; it exists.
+
+    Returns
+    -------
+    page : Path
+        ``index.html`` in the folder.
+    """
+    figure = errors_and_biases(numbers.summary, numbers.curves, numbers.limit, KCM16)
+    for suffix in ("svg", "pdf", "png"):
+        write_whole(
+            folder / f"errors_and_biases.{suffix}",
+            lambda path: figure.savefig(path, dpi=160, metadata=_NO_DATE.get(path.suffix[1:], {})),
+        )
+    write_rows(rows(numbers.summary), folder / "errors_and_biases.ecsv")
+    page = folder / "index.html"
+    write_whole(page, lambda path: path.write_text(_page(numbers, figure), encoding="utf-8"))
+    return page
+
+
+_NO_DATE: dict[str, dict[str, Any]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+
+
+def _page(numbers: ErrorsAndBiases, figure: Figure) -> str:
+    config = numbers.config
+    svg = io.StringIO()
+    figure.savefig(svg, format="svg", metadata=_NO_DATE["svg"])
+    where = config.stars
+    stars = f"l = {where.l:g}°, b = {where.b:g}° of the analytic Galaxy" if where.catalog is None else str(where.catalog)
+    return _PAGE.format(
+        answer=_answer(numbers),
+        figure=svg.getvalue()[svg.getvalue().index("<svg") :],
+        n_stars=config.n_stars,
+        n_stacks=f"{config.n_stacks:,}".replace(",", " "),
+        mag=f"{where.mag[0]:g} to {where.mag[1]:g}",
+        band=escape(where.band or "i"),
+        requirement=escape(KCM16.source),
+        agreement=_agreement(numbers.summary),
+        table=_table(numbers.summary),
+        stars=escape(stars),
+        pairs=f"At a binary fraction of 0.35, {numbers.removed_fraction:.0%} of the pairs are resolved and removed.",
+        config=escape(config.model_dump_json(exclude_none=True, indent=1)),
+        version=__version__,
+    )
+
+
+def _answer(numbers: ErrorsAndBiases) -> str:
+    limit = numbers.limit.isel(psf=0).sel(quantity="r2").interp(binary_fraction=0.35)
+    share = float(limit["bias"]) / KCM16.sigma_r2
+    return (
+        f"With 35 % binaries the mean of x is {numbers.mean_x:.3g} arcsec², which makes the stacked PSF "
+        f"{float(limit['bias']):.2e} larger: {share:.0%} of the size requirement of {KCM16.sigma_r2:g}. "
+        "More stars in the stack lower the scatter, not this bias."
+    )
+
+
+def _agreement(summary: xr.Dataset) -> str:
+    pulls = {
+        name: np.abs((summary[name] - summary[f"prediction_{name}"]) / summary[f"{name}_se"]).max().item()
+        for name in ("bias", "sigma", "sd")
+    }
+    checked = int(np.isfinite(summary["bias"]).sum()) * len(pulls)
+    worst = ", ".join(f"{name} {pull:.1f}" for name, pull in pulls.items())
+    return f"Largest difference of {checked} numbers, in standard errors of the simulation: {worst}."
+
+
+def _table(summary: xr.Dataset) -> str:
+    names = ("bias", "bias_se", "prediction_bias", "sigma", "sigma_se", "prediction_sigma")
+    head = "".join(f"<th scope='col'>{n}</th>" for n in ("PSF", "quantity", "binary fraction", "stacks", *names))
+    body = "".join(
+        f"<tr><td>{escape(row['psf'])}</td><td>{row['quantity']}</td>"
+        f"<td>{row['f_lo']:.2f}–{row['f_hi']:.2f}</td><td>{row['n_stacks']}</td>"
+        + "".join(f"<td>{row[name]:.3e}</td>" for name in names)
+        + "</tr>\n"
+        for row in rows(summary)
+    )
+    return f"<table><caption>Per PSF, quantity and bin</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

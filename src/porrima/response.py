@@ -1,0 +1,276 @@
+r"""Measured shape of a stack from its kernel moments, without an image: derivatives and exact solution.
+
+A stack is the PSF convolved with its mean kernel D.  Against a Gaussian weight W of centre
+:math:`x_0` and covariance M, n-th derivatives of W integrate, by parts, to
+
+.. math:: T_\alpha = \int (\mathrm{PSF} * D)\, \partial^\alpha W
+          = \sum_{ab} \frac{m_{ab}}{a!\, b!} J_{\alpha + (a, b)}, \qquad
+          J_\alpha = \int \mathrm{PSF}\, \partial^\alpha W ,
+
+where :math:`m_{ab}` are the kernel moments.  Weighted centroid and second moments are ratios of such T,
+and since :math:`\partial J_\alpha / \partial x_{0,i} = -J_{\alpha + e_i}` and
+:math:`\partial J_\alpha / \partial M_{ij} = \frac12 J_{\alpha + e_i + e_j}` (heat equation), all
+derivatives of the measurement are sums of J as well.  The J of one PSF are computed once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit, prange
+
+from porrima.moments import INDICES, N_MOMENTS, ORDER
+from porrima.shapes import Adaptive, Failure, GaussianWeight, Plain, Shape
+from porrima.weighted import Derivatives, WeightedPSF, covariance_derivatives, exact_covariance, weighted_psf
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from porrima.moments import KernelMoments
+    from porrima.psf import PSF
+    from porrima.shapes import Estimator
+
+    FloatArray = NDArray[np.float64]
+
+__all__ = ["Response", "response"]
+
+EXACT_THRESHOLD = 0.005
+"""Change of shape above which second order is left for the exact solution (dimensionless)."""
+
+SERIES_LIMIT = 0.01
+"""Largest share of moments of the highest order in a size change; what they leave out is about a third of
+theirs (dimensionless)."""
+
+GROWTH_LIMIT = 0.3
+"""Largest relative change of R² for which an adaptive weight is followed: 5e-4 of that change is lost there,
+and ten times more for every tenth beyond (dimensionless)."""
+
+CHUNK = 1 << 16
+"""Stacks evaluated at once, so that the memory needed does not grow with their number (count)."""
+
+_XX, _XY, _YY = (INDICES.index(powers) for powers in ((2, 0), (1, 1), (0, 2)))
+
+
+@njit(cache=True)
+def _second_order_of(values, first, second, out):  # type: ignore[no-untyped-def]
+    """Change of (e1, e2, r2) of one stack, first order plus half the second."""
+    size = values.size
+    product = np.empty(size)
+    for k in range(3):
+        for j in range(size):
+            product[j] = first[k, j]
+        for i in range(size):
+            half = 0.5 * values[i]
+            for j in range(size):
+                product[j] += half * second[k, i, j]
+        total = 0.0
+        for j in range(size):
+            total += product[j] * values[j]
+        out[k] = total
+
+
+@njit(cache=True, parallel=True)
+def _second_order(values, first, second):  # type: ignore[no-untyped-def]
+    """Change of (e1, e2, r2) of each stack, (n, 3).
+
+    Not a product of matrices: BLAS may round a row by how many rows there are, and the same stack must
+    give the same bits in any chunk.
+    """
+    out = np.empty((values.shape[0], 3))
+    for n in prange(values.shape[0]):
+        _second_order_of(values[n], first, second, out[n])
+    return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Response:
+    r"""What an estimator makes of small kernels behind one PSF.
+
+    Parameters
+    ----------
+    psf, estimator : str
+        Their names.
+    shape0 : Shape
+        Shape of the PSF without companions; r2 in arcsec².
+    first : (3, n_moment) float array
+        :math:`\partial s / \partial m_{ab}` of s = (e1, e2, r2) in the order of `moments.INDICES`, in
+        arcsec^-(a+b), times arcsec² for r2.
+    second : (3, n_moment, n_moment) float array
+        :math:`\partial^2 s / \partial m_{ab} \partial m_{cd}`, symmetric, in arcsec^-(a+b+c+d), times
+        arcsec² for r2.
+    weighted : WeightedPSF or None
+        For the exact solution; None where the measurement has no weight.
+
+    References
+    ----------
+    KCM16, Hirata2003
+    """
+
+    psf: str
+    estimator: str
+    shape0: Shape
+    first: FloatArray
+    second: FloatArray
+    weighted: WeightedPSF | None
+
+    @property
+    def kappa_r2(self) -> float:
+        r""":math:`\delta R^2 / (R_0^2 \eta)` for an isotropic population, r → 0 (dimensionless)."""
+        return float(self._isotropic()[2] / self.shape0.r2)
+
+    @property
+    def de1_deta(self) -> float:
+        r""":math:`\delta e_1 / \eta` for an isotropic population, r → 0 (dimensionless)."""
+        return float(self._isotropic()[0])
+
+    @property
+    def de2_deta(self) -> float:
+        r""":math:`\delta e_2 / \eta` for an isotropic population, r → 0 (dimensionless)."""
+        return float(self._isotropic()[1])
+
+    def _isotropic(self) -> FloatArray:
+        """Change of (e1, e2, r2) per eta: m20 = m02 = eta R0² / 2, and nothing else at first order."""
+        change: FloatArray = (self.first[:, _XX] + self.first[:, _YY]) * self.shape0.r2 / 2
+        return change
+
+    def shapes(self, moments: KernelMoments, threshold: float = EXACT_THRESHOLD) -> Shape:
+        r"""Measured shapes of stacks.
+
+        Parameters
+        ----------
+        moments : KernelMoments
+            Mean kernel moments of n stacks.
+        threshold : float
+            Relative change of R², or change of e1 or e2, above which the measurement is solved exactly;
+            0 solves all (dimensionless).
+
+        Returns
+        -------
+        shape : Shape
+            (n,) arrays; NaN and flagged where there is no solution, or where the series cannot be
+            trusted: moments of order `ORDER` have more than `SERIES_LIMIT` of the size change, or an
+            adaptive weight changes by more than `GROWTH_LIMIT`.
+
+        Notes
+        -----
+        .. math:: s = s_0 + \frac{\partial s}{\partial m} m
+                  + \frac12 m^T \frac{\partial^2 s}{\partial m^2} m .
+
+        Its error is third order in the change, 1e-4 of it where it is 0.5 %.  Without a weight the result
+        is :math:`Q_0 + m_2`, exact.  The kernels themselves are known to order `ORDER`: 1e-6 of the
+        change for separations of 0.05 arcsec behind a FWHM of 0.137 arcsec.
+        """
+        pieces = [
+            self._shapes(moments.values[start : start + CHUNK], threshold)
+            for start in range(0, max(1, len(moments)), CHUNK)
+        ]
+        return Shape(**{k: np.concatenate([getattr(p, k) for p in pieces]) for k in Shape.__slots__})
+
+    def _shapes(self, values: FloatArray, threshold: float) -> Shape:
+        """Shapes of one chunk of stacks."""
+        flag = np.where(np.all(np.isfinite(values), axis=1), 0, int(Failure.NOT_FINITE))
+        values = np.where(flag[:, None] == 0, values, 0.0)
+        if self.weighted is None:
+            return Shape.from_covariance(self.shape0.covariance() + values[:, [_XX, _XY, _YY]], flag)
+        change = _second_order(np.ascontiguousarray(values), self.first, self.second)
+        highest = slice(N_MOMENTS - ORDER - 1, N_MOMENTS)
+        tail = np.einsum("ni,i->n", values[:, highest], self.first[2, highest])
+        size = values[:, _XX] + values[:, _YY]
+        grown = (self.weighted.fixed == 0) & (np.abs(change[:, 2]) > GROWTH_LIMIT * self.shape0.r2)
+        flag[grown | (np.abs(tail) > SERIES_LIMIT * np.abs(size))] |= Failure.SERIES
+        relative = np.abs(change) / np.array([1.0, 1.0, self.shape0.r2])
+        shape = Shape(
+            e1=self.shape0.e1 + change[:, 0],
+            e2=self.shape0.e2 + change[:, 1],
+            r2=self.shape0.r2 + change[:, 2],
+            flag=flag,
+        )
+        covariance = shape.covariance()
+        large = (relative.max(axis=1) > threshold) & (flag == 0)
+        if large.any():
+            covariance[large] = exact_covariance(self.weighted, values[large], covariance[large])
+            flag[large] = np.where(np.isfinite(covariance[large, 0]), 0, int(Failure.NOT_CONVERGED))
+        return Shape.from_covariance(covariance, flag)
+
+
+def _shape_derivatives(covariance: FloatArray) -> Derivatives:
+    """Gradient (3, 3) and Hessian (3, 3, 3) of (e1, e2, r2) by (Q11, Q12, Q22)."""
+    trace = covariance[0] + covariance[2]
+    of_trace = np.array([1.0, 0.0, 1.0])
+    first, second = np.zeros((3, 3)), np.zeros((3, 3, 3))
+    first[2] = of_trace
+    for k, of_part in enumerate(np.array([[1.0, 0.0, -1.0], [0.0, 2.0, 0.0]])):
+        e = of_part @ covariance / trace
+        first[k] = (of_part - e * of_trace) / trace
+        mixed = np.outer(of_trace, first[k])
+        second[k] = -(mixed + mixed.T) / trace
+    return Derivatives(first=first, second=second)
+
+
+def _unweighted(psf: PSF, estimator: Estimator) -> Response:
+    """Response of plain moments: Q = Q0 + m2, from the image of the PSF alone."""
+    shape0 = estimator.measure(psf.draw())
+    by_moment = np.zeros((3, N_MOMENTS))
+    by_moment[[0, 1, 2], [_XX, _XY, _YY]] = 1.0
+    outer = _shape_derivatives(shape0.covariance())
+    return Response(
+        psf=psf.name,
+        estimator=estimator.name,
+        shape0=shape0,
+        first=outer.first @ by_moment,
+        second=np.einsum("kij,im,jn->kmn", outer.second, by_moment, by_moment, optimize=True),
+        weighted=None,
+    )
+
+
+def response(psf: PSF, estimator: Estimator) -> Response:
+    """Response of an estimator behind a PSF.
+
+    Parameters
+    ----------
+    psf : PSF
+        Any PSF: only its image, drawn once, enters.
+    estimator : Estimator
+        `Plain`, `Adaptive` or `GaussianWeight`.
+
+    Returns
+    -------
+    response : Response
+        Kept, so that the same question is answered at once.
+
+    Raises
+    ------
+    TypeError
+        If the estimator is none of the three.
+    ValueError
+        If the PSF has no fixed point under the weight.
+    """
+    return _response(psf, estimator)
+
+
+@lru_cache(maxsize=32)
+def _response(psf: PSF, estimator: Estimator) -> Response:
+    """What `response` keeps."""
+    if isinstance(estimator, Plain):
+        return _unweighted(psf, estimator)
+    if not isinstance(estimator, Adaptive | GaussianWeight):
+        raise TypeError(
+            f"estimator must be Plain, Adaptive or GaussianWeight, got {type(estimator).__name__}"
+        )
+    weighted = weighted_psf(psf, estimator.sigma if isinstance(estimator, GaussianWeight) else 0.0)
+    inner, outer = covariance_derivatives(weighted), _shape_derivatives(weighted.covariance)
+    second = np.einsum("kij,im,jn->kmn", outer.second, inner.first, inner.first, optimize=True)
+    second += np.einsum("ki,imn->kmn", outer.first, inner.second)
+    arcsec = weighted.unit ** -np.sum(INDICES, axis=1, dtype=float)  # from powers of unit to powers of arcsec
+    size = np.array([1.0, 1.0, weighted.unit**2])
+    return Response(
+        psf=psf.name,
+        estimator=estimator.name,
+        shape0=Shape.from_covariance(weighted.covariance * weighted.unit**2),
+        first=outer.first @ inner.first * arcsec * size[:, None],
+        second=second * np.outer(arcsec, arcsec) * size[:, None, None],
+        weighted=weighted,
+    )

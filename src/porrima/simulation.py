@@ -1,0 +1,374 @@
+"""A run: stars and companions from a configuration, stacks in chunks, a store that survives interruption."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import xarray as xr
+import zarr
+
+from porrima import __version__
+from porrima.config import PopulationConfig, RunConfig, canonical, parse
+from porrima.errors import InputError
+from porrima.moments import INDICES, N_MOMENTS, KernelMoments
+from porrima.psf import psf_from_name
+from porrima.response import response
+from porrima.shapes import estimator_from_name
+from porrima.stack import draw_stacks, draw_systems
+from porrima.stars import Stars
+from porrima.systems import BRIGHT_MASS, Population
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from porrima.shapes import Shape
+
+    FloatArray = NDArray[np.float64]
+
+__all__ = ["Method", "draw_stars", "open_run", "population_of", "simulate"]
+
+Method = Literal["moments", "images"]
+
+CHUNK = 10_000
+"""Stacks in a chunk: what an interruption can lose."""
+
+_STAR_COLUMNS = ("mass", "distance", "magnitude", "metallicity", "log_age")
+_GALAXY_STREAM = 1  # spawn key of the stars' generator; the engine's streams are keyed by the seed alone
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Chunk:
+    """Results of the stacks first to last - 1."""
+
+    first: int
+    last: int
+    binary_fraction: FloatArray
+    shapes: FloatArray  # (3, n_psf, n): e1, e2, r2
+    moments: FloatArray
+
+
+def draw_stars(config: PopulationConfig) -> Stars:
+    """Stars of a configuration: read or drawn, selected by magnitude and mass.
+
+    Parameters
+    ----------
+    config : PopulationConfig
+        With a direction or a catalogue.
+
+    Returns
+    -------
+    stars : Stars
+        Main-sequence stars up to 1.5 M_sun in the magnitude range.
+
+    Raises
+    ------
+    InputError
+        If the catalogue is wrong or no star is left.
+    """
+    if config.stars.catalog is not None:
+        from porrima.catalogs import read_catalog  # noqa: PLC0415  (astropy's readers, where used)
+
+        catalog = read_catalog(
+            config.stars.catalog, format=config.stars.format, columns=config.stars.map, band=config.stars.band
+        )
+        stars = catalog.stars
+    else:
+        from porrima.galaxy import Robin2003  # noqa: PLC0415  (the Galaxy's tables, where used)
+
+        rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(config.seed, spawn_key=(_GALAXY_STREAM,))))
+        where = config.stars
+        stars = Robin2003().draw(
+            where.l, where.b, where.area or 1.0, where.band or "i", where.mag, rng, n=None if where.area else where.n_drawn
+        )
+    selected = stars.select(magnitude=config.stars.mag, mass_max=BRIGHT_MASS)
+    if len(selected) == 0:
+        low, high = config.stars.mag
+        raise InputError(
+            f"no main-sequence star up to {BRIGHT_MASS} M_sun with magnitude in [{low}, {high})",
+            source=config.stars.catalog,
+            key="mag",
+        )
+    return selected
+
+
+def population_of(config: PopulationConfig, stars: Stars) -> Population:
+    """Population of a configuration.
+
+    Parameters
+    ----------
+    config : PopulationConfig
+        Models and cut.
+    stars : Stars
+        Already selected.
+
+    Returns
+    -------
+    population : Population
+        What simulation and prediction start from.
+    """
+    return Population.of(
+        stars, multiplicity=config.multiplicity.build(), photometry=config.photometry.build(), cut=config.cut
+    )
+
+
+def simulate(
+    config: RunConfig,
+    path: Path,
+    *,
+    resume: bool = False,
+    method: Method = "moments",
+    chunk: int = CHUNK,
+    progress: Callable[[int], None] = lambda _: None,
+) -> int:
+    """Number of stacks computed and written to a store; those already there are left as they are.
+
+    Parameters
+    ----------
+    config : RunConfig
+        The run.
+    path : Path
+        Store to make (a folder), or to complete with `resume`.
+    resume : bool
+        Go on with a store of the same configuration; without it an existing path is refused.
+    method : {"moments", "images"}
+        Shapes from kernel moments through the response, or from images drawn and measured with GalSim.
+    chunk : int
+        Stacks per chunk (count); a resumed run keeps that of its store.
+    progress : callable
+        Called with the number of stacks done after each chunk.
+
+    Returns
+    -------
+    n_stacks : int
+        Computed in this call (count).
+
+    Raises
+    ------
+    InputError
+        If the path cannot be written, exists, or holds another configuration; or the configuration is wrong.
+    """
+    run = _Run(config=config, population=population_of(config, draw_stars(config)), method=method)
+    store = _open_or_create(run, path, resume, chunk)
+    chunk = store["binary_fraction"].chunks[0]
+    computed = 0
+    for number, first in enumerate(range(0, config.n_stacks, chunk)):
+        last = min(first + chunk, config.n_stacks)
+        if not _is_written(path, number):
+            _write_chunk(store, path, run.chunk(first, last))
+            computed += last - first
+        progress(last - first)
+    for leftover in path.rglob("*.partial"):  # of a process that was killed while it wrote
+        leftover.unlink()
+    return computed
+
+
+def open_run(path: Path) -> tuple[xr.Dataset, RunConfig, Population]:
+    """A finished run: its dataset, configuration and population.
+
+    Parameters
+    ----------
+    path : Path
+        Store that `simulate` made.
+
+    Returns
+    -------
+    dataset, config, population : Dataset, RunConfig, Population
+        Shapes dimensionless and in arcsec², moments in arcsec^(a+b).
+
+    Raises
+    ------
+    InputError
+        If the path is not a run, or the run is not complete.
+    """
+    try:
+        dataset = xr.open_zarr(path, chunks=None)
+        config = parse(RunConfig, json.loads(dataset.attrs["config"]), source=path)
+    except (OSError, KeyError, ValueError):
+        raise InputError("is not a run of porrima simulate", source=path) from None
+    chunk = dataset["binary_fraction"].encoding["chunks"][0]
+    missing = [n for n in range(-(-dataset.sizes["stack"] // chunk)) if not _is_written(path, n)]
+    if missing:
+        raise InputError(f"is not complete ({len(missing)} chunks missing): run again with --resume", source=path)
+    stars = Stars.from_columns(
+        **{name: dataset[f"star_{name}"].to_numpy() for name in _STAR_COLUMNS}, band=dataset.attrs["band"]
+    )
+    return dataset, config, population_of(config, stars)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Run:
+    """What a chunk needs to be computed, anywhere."""
+
+    config: RunConfig
+    population: Population
+    method: Method
+
+    def chunk(self, first: int, last: int) -> _Chunk:
+        config = self.config
+        stacks = draw_stacks(
+            self.population,
+            n_stars=config.n_stars,
+            binary_fraction=config.binary_fraction,
+            seed=config.seed,
+            first=first,
+            last=last,
+        )
+        shapes = np.empty((3, len(config.psf), last - first))
+        for p, name in enumerate(config.psf):
+            shape = (
+                self._from_moments(name, stacks.moments)
+                if self.method == "moments"
+                else self._from_images(name, first, last)
+            )
+            shapes[:, p] = shape.e1, shape.e2, shape.r2
+        return _Chunk(
+            first=first,
+            last=last,
+            binary_fraction=stacks.binary_fraction,
+            shapes=shapes,
+            moments=stacks.moments.values,
+        )
+
+    def _from_moments(self, psf: str, moments: KernelMoments) -> Shape:
+        return response(psf_from_name(psf), estimator_from_name(self.config.estimator)).shapes(moments)
+
+    def _from_images(self, psf: str, first: int, last: int) -> Shape:
+        from porrima.images import measure_stack  # noqa: PLC0415  (GalSim's drawing, where used)
+
+        config = self.config
+        shapes = [
+            measure_stack(
+                psf_from_name(psf),
+                draw_systems(
+                    self.population,
+                    n_stars=config.n_stars,
+                    binary_fraction=config.binary_fraction,
+                    seed=config.seed,
+                    stack=stack,
+                ),
+                estimator_from_name(config.estimator),
+            )
+            for stack in range(first, last)
+        ]
+        return type(shapes[0])(
+            **{
+                name: np.array([getattr(shape, name) for shape in shapes]).reshape(-1)
+                for name in ("e1", "e2", "r2", "flag")
+            }
+        )
+
+    def shape_without_companions(self, psf: str) -> Shape:
+        single = KernelMoments(values=np.zeros((1, N_MOMENTS)), n_stars=1)
+        if self.method == "moments":
+            return self._from_moments(psf, single)
+        from porrima.images import measure_stack  # noqa: PLC0415  (GalSim's drawing, where used)
+        from porrima.systems import Systems  # noqa: PLC0415
+
+        zero = np.zeros(1)
+        return measure_stack(
+            psf_from_name(psf), Systems.from_pairs(zero, zero, zero), estimator_from_name(self.config.estimator)
+        )
+
+    @property
+    def identity(self) -> str:
+        """Hash of all that the numbers depend on."""
+        digest = hashlib.sha256(f"{canonical(self.config)} {self.method} {__version__}".encode())
+        for name in _STAR_COLUMNS:
+            digest.update(np.ascontiguousarray(getattr(self.population.stars, name)).tobytes())
+        return digest.hexdigest()
+
+
+def _open_or_create(run: _Run, path: Path, resume: bool, chunk: int) -> Any:
+    if path.exists():
+        if not resume:
+            raise InputError("exists already; go on with it by --resume, or choose another", key="output", value=path)
+        try:
+            store = zarr.open_group(path, mode="r+")
+            identity = store.attrs["identity"]
+        except (OSError, KeyError, ValueError):
+            raise InputError("is not a run of porrima simulate", key="output", value=path) from None
+        if identity != run.identity:
+            raise InputError("holds a run of another configuration, stars or version", key="output", value=path)
+        return store
+    parent = path.parent if str(path.parent) else path
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError("must lie in a folder that can be written", key="output", value=path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        _create(run, unfinished, min(chunk, run.config.n_stacks))
+        unfinished.rename(path)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    return zarr.open_group(path, mode="r+")
+
+
+def _create(run: _Run, path: Path, chunk: int) -> None:
+    """Make an empty store with everything that is known before the first stack."""
+    config = run.config
+    alone = [run.shape_without_companions(name) for name in config.psf]
+    scalars = {
+        f"{name}_0": (("psf",), np.array([float(np.squeeze(getattr(shape, name))) for shape in alone]), attrs)
+        for name, attrs in (("e1", {}), ("e2", {}), ("r2", {"units": "arcsec2"}))
+    }
+    stars = {
+        f"star_{name}": (("star",), np.asarray(getattr(run.population.stars, name))) for name in _STAR_COLUMNS
+    }
+    known = xr.Dataset(
+        {**scalars, **stars},
+        coords={"psf": list(config.psf), "moment": [f"m{a}{b}" for a, b in INDICES]},
+        attrs={
+            "config": canonical(config),
+            "method": run.method,
+            "identity": run.identity,
+            "stars": run.population.stars.source,
+            "band": run.population.stars.band,
+            "versions": json.dumps(
+                {"porrima": __version__} | {name: version(name) for name in ("numpy", "numba", "galsim")}
+            ),
+            "references": "KCM16 (arXiv:1512.01549); Duchene & Kraus 2013; Robin et al. 2003; Bressan et al. 2012",
+        },
+    )
+    known.to_zarr(path, zarr_format=2, consolidated=False)
+    group = zarr.open_group(path, mode="r+")
+    n, n_psf = config.n_stacks, len(config.psf)
+    layout: list[tuple[str, tuple[str, ...], tuple[int, ...], tuple[int, ...]]] = [
+        ("binary_fraction", ("stack",), (n,), (chunk,)),
+        *((name, ("psf", "stack"), (n_psf, n), (n_psf, chunk)) for name in ("e1", "e2", "r2")),
+        ("moments", ("stack", "moment"), (n, N_MOMENTS), (chunk, N_MOMENTS)),
+    ]
+    for name, dimensions, shape, chunks in layout:
+        group.create_array(
+            name,
+            shape=shape,
+            chunks=chunks,
+            dtype="f8",
+            fill_value=float("nan"),
+            attributes={"_ARRAY_DIMENSIONS": list(dimensions)},
+        )
+    zarr.consolidate_metadata(path)
+
+
+def _is_written(path: Path, number: int) -> bool:
+    """Whether a chunk is complete: its moments are written last, and a file appears whole or not at all."""
+    return (path / "moments" / f"{number}.0").exists()
+
+
+def _write_chunk(store: Any, path: Path, chunk: _Chunk) -> None:
+    some = slice(chunk.first, chunk.last)
+    try:
+        store["binary_fraction"][some] = chunk.binary_fraction
+        for q, name in enumerate(("e1", "e2", "r2")):
+            store[name][:, some] = chunk.shapes[q]
+        store["moments"][some] = chunk.moments
+    except OSError as error:
+        raise InputError(f"cannot be written ({error.strerror})", key="output", value=path) from None

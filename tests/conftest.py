@@ -1,0 +1,28 @@
+"""Fixtures that several tests share."""
+
+import numpy as np
+import pytest
+
+from porrima.multiplicity import MULTIPLICITY
+from porrima.photometry import PHOTOMETRY
+from porrima.stars import Stars
+from porrima.systems import Population
+
+
+@pytest.fixture(scope="session")
+def stars():
+    """Three hundred stars of all kinds, as a magnitude bin holds them."""
+    rng = np.random.Generator(np.random.Philox(20261122))
+    n = 300
+    return Stars.from_columns(
+        mass=rng.uniform(0.085, 1.2, n),
+        distance=10 ** rng.uniform(2.2, 3.6, n),
+        magnitude=rng.uniform(18, 19, n),
+        metallicity=rng.uniform(-2, 0.2, n),
+        log_age=rng.uniform(9.0, 10.1, n),
+    )
+
+
+@pytest.fixture(scope="session")
+def population(stars):
+    return Population.of(stars, multiplicity=MULTIPLICITY["dk13"], photometry=PHOTOMETRY["main-sequence"])

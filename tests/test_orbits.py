@@ -1,0 +1,46 @@
+import numpy as np
+import pytest
+from statistics_helpers import assert_within_sigma
+
+from porrima.orbits import projection_factor, projection_nodes
+
+MEAN_SQUARE = {"isotropic": 2 / 3, "inclination-uniform": 3 / 4}
+MEAN_FOURTH = {"isotropic": 8 / 15, "inclination-uniform": 1 - 2 / 4 + 9 / 64}
+
+
+@pytest.mark.parametrize("projection", MEAN_SQUARE)
+def test_quadrature_over_orientations_is_exact_for_powers(projection):
+    factor, weight = projection_nodes(projection)
+    assert weight.sum() == pytest.approx(1)
+    assert np.all((factor > 0) & (factor <= 1))
+    assert factor**2 @ weight == pytest.approx(MEAN_SQUARE[projection], rel=1e-14)
+    assert factor**4 @ weight == pytest.approx(MEAN_FOURTH[projection], rel=1e-14)
+
+
+@pytest.mark.parametrize("projection", MEAN_SQUARE)
+def test_quadrature_resolves_a_cut(projection):
+    # share of orbits whose projection is below rho, smoothed over 0.2 dex as the log-normal does
+    factor, weight = projection_nodes(projection)
+    u = (np.arange(400) + 0.5) / 400
+    fine = np.array([projection_factor.py_func(projection == "isotropic", x, y) for x in u for y in u])
+    smooth = lambda rho: 1 / (1 + (rho / 0.6) ** 8)  # noqa: E731
+    assert smooth(factor) @ weight == pytest.approx(smooth(fine).mean(), abs=2e-5)
+
+
+@pytest.mark.parametrize("projection", MEAN_SQUARE)
+def test_drawn_orientations_against_points_on_an_orbit(projection):
+    """An orbit turned at random in three dimensions, positions projected: written without the module."""
+    rng = np.random.Generator(np.random.Philox(7))
+    n = 200_000
+    cosine = rng.random(n) if projection == "isotropic" else np.cos(0.5 * np.pi * rng.random(n))
+    phase = 2 * np.pi * rng.random(n)
+    x, y = np.cos(phase), np.sin(phase) * cosine
+    square = x**2 + y**2
+    drawn = np.array([projection_factor.py_func(projection == "isotropic", *rng.random(2)) for _ in range(20_000)]) ** 2
+    for power in (1, 2):
+        assert_within_sigma(
+            (square**power).mean(),
+            (drawn**power).mean(),
+            np.hypot((square**power).std() / n**0.5, (drawn**power).std() / drawn.size**0.5),
+        )
+    assert_within_sigma(square.mean(), MEAN_SQUARE[projection], square.std() / n**0.5)
