@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
 
-from porrima.moments import INDICES, N_MOMENTS, ORDER, KernelMoments, angular_mean, moments_of_points, pair_coefficient
+from porrima.moments import (
+    INDICES,
+    N_MOMENTS,
+    ORDER,
+    KernelMoments,
+    angular_mean,
+    moments_of_points,
+    pair_coefficient,
+)
 from porrima.systems import Systems
 
 
@@ -31,7 +39,9 @@ def test_angular_means_against_a_ring():
     theta = 2 * np.pi * np.arange(64) / 64
     for a in range(9):
         for b in range(9):
-            assert angular_mean(a, b) == pytest.approx(np.mean(np.cos(theta) ** a * np.sin(theta) ** b), abs=1e-15)
+            assert angular_mean(a, b) == pytest.approx(
+                np.mean(np.cos(theta) ** a * np.sin(theta) ** b), abs=1e-15
+            )
 
 
 def test_a_wrong_axis_is_refused():

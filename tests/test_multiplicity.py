@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from data_files import data_file
 
+from data_files import data_file
 from porrima.catalogs import read_catalog
 from porrima.multiplicity import MULTIPLICITY, DucheneKraus2013, multiplicity_scale
 
@@ -45,7 +45,13 @@ def test_mean_multiplicity_of_the_real_catalogue(rule, expected):
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("gap_rule", "upper"), ("a_max_factor", 0.0), ("scatter_scale", -1.0), ("projection", "none"), ("mass_ratio_min", 1.0)],
+    [
+        ("gap_rule", "upper"),
+        ("a_max_factor", 0.0),
+        ("scatter_scale", -1.0),
+        ("projection", "none"),
+        ("mass_ratio_min", 1.0),
+    ],
 )
 def test_bad_options_are_named(option, value):
     with pytest.raises(ValueError, match=f"{option} must be .* got {value}"):
@@ -74,5 +80,5 @@ def test_scaling_works_for_as_many_fractions_as_stars():
 def test_impossible_binary_fractions_are_refused():
     with pytest.raises(ValueError, match=r"binary_fraction must be in \[0, 1\], got 1.2"):
         multiplicity_scale(np.array([0.3]), np.array([0.5, 1.2]))
-    with pytest.raises(ValueError, match="binary_fraction must be at most 0.5 for these stars, got 0.6"):
+    with pytest.raises(ValueError, match=r"binary_fraction must be at most 0.5 for these stars, got 0.6"):
         multiplicity_scale(np.array([0.0, 0.3]), np.array([0.6]))

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from statistics_helpers import assert_within_sigma
 
 from porrima.orbits import projection_factor, projection_nodes
+from statistics_helpers import assert_within_sigma
 
 MEAN_SQUARE = {"isotropic": 2 / 3, "inclination-uniform": 3 / 4}
 MEAN_FOURTH = {"isotropic": 8 / 15, "inclination-uniform": 1 - 2 / 4 + 9 / 64}
@@ -36,7 +36,12 @@ def test_drawn_orientations_against_points_on_an_orbit(projection):
     phase = 2 * np.pi * rng.random(n)
     x, y = np.cos(phase), np.sin(phase) * cosine
     square = x**2 + y**2
-    drawn = np.array([projection_factor.py_func(projection == "isotropic", *rng.random(2)) for _ in range(20_000)]) ** 2
+    drawn = (
+        np.array(
+            [projection_factor.py_func(projection == "isotropic", *rng.random(2)) for _ in range(20_000)]
+        )
+        ** 2
+    )
     for power in (1, 2):
         assert_within_sigma(
             (square**power).mean(),

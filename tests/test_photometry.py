@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 from astropy.table import Table
-from data_files import data_file
 
+from data_files import data_file
 from porrima.photometry import PHOTOMETRY, HabetsHeintze1981, MainSequence, flux_ratio, magnitudes
 
 
@@ -26,7 +26,9 @@ def test_between_points_magnitudes_are_linear_in_log_mass_metallicity_and_age():
     model = MainSequence()
     middle = np.sqrt(0.5 * 0.55)
     ends = magnitudes(place(model, [0.5, 0.55]), np.array([[0.5], [0.55]]))
-    assert magnitudes(place(model, middle), np.array([[middle]]))[0, 0] == pytest.approx(ends.mean(), abs=2e-3)
+    assert magnitudes(place(model, middle), np.array([[middle]]))[0, 0] == pytest.approx(
+        ends.mean(), abs=2e-3
+    )
     mean_age = np.log10(0.5 * (10**9.0 + 10**9.8))
     for points in (((0.0, 9.0), (-0.5, 9.0), (-0.25, 9.0)), ((0.0, 9.0), (0.0, 9.8), (0.0, mean_age))):
         m = np.array([[0.4]])
@@ -42,7 +44,9 @@ def test_low_masses_end_where_besancon_has_them():
 
 
 def test_a_dark_companion_gives_no_light():
-    assert flux_ratio(place(MainSequence(), 0.5), np.array([0.5]), np.array([[0.1, 0.159]])).tolist() == [[0, 0]]
+    assert flux_ratio(place(MainSequence(), 0.5), np.array([0.5]), np.array([[0.1, 0.159]])).tolist() == [
+        [0, 0]
+    ]
 
 
 @pytest.mark.parametrize("name", PHOTOMETRY)
@@ -66,9 +70,14 @@ def test_a_main_sequence_star_is_not_older_than_its_turn_off():
     assert zero_age - 1.0 < oldest < zero_age
 
 
-@pytest.mark.parametrize(("mass", "expected"), [(0.1, 14.63), (0.5, 4.80 - 12.47 * np.log10(0.5)), (1.0, 4.80), (2.0, 4.0 - 6.41 * np.log10(2.0))])
+@pytest.mark.parametrize(
+    ("mass", "expected"),
+    [(0.1, 14.63), (0.5, 4.80 - 12.47 * np.log10(0.5)), (1.0, 4.80), (2.0, 4.0 - 6.41 * np.log10(2.0))],
+)
 def test_habets_and_heintze_as_printed(mass, expected):
-    assert magnitudes(place(HabetsHeintze1981(), mass), np.array([[mass]]))[0, 0] == pytest.approx(expected, abs=1e-3)
+    assert magnitudes(place(HabetsHeintze1981(), mass), np.array([[mass]]))[0, 0] == pytest.approx(
+        expected, abs=1e-3
+    )
 
 
 def test_the_primary_s_branch_can_serve_both_stars():
@@ -80,5 +89,5 @@ def test_the_primary_s_branch_can_serve_both_stars():
 def test_masses_and_bands_beyond_the_relation_are_refused():
     with pytest.raises(ValueError, match=r"mass must be in \[0.08, 1.5\] M_sun for main-sequence, got 1.6"):
         place(MainSequence(), [1.0, 1.6])
-    with pytest.raises(ValueError, match="band must be one of g, r, i, z, .* got J"):
+    with pytest.raises(ValueError, match=r"band must be one of g, r, i, z, .* got J"):
         place(MainSequence(), 1.0, band="J")

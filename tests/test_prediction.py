@@ -1,10 +1,10 @@
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import beta, betainc
-from statistics_helpers import assert_within_sigma
 
 from porrima import prediction
 from porrima.moments import INDICES
@@ -17,6 +17,7 @@ from porrima.shapes import estimator_from_name
 from porrima.stack import draw_stacks
 from porrima.stars import Stars
 from porrima.systems import Population
+from statistics_helpers import assert_within_sigma
 
 MODELS = {
     "published": DucheneKraus2013(),
@@ -34,7 +35,9 @@ def test_integrals_against_adaptive_quadrature(options):
     """One star with the analytic relation: f is q^(0.4 x 12.47), so scipy can do the integrals as they stand."""
     star = Stars.from_columns(mass=[1.0], distance=[700.0], magnitude=[18.0])
     model = DucheneKraus2013(**options)
-    population = Population.of(star, multiplicity=model, photometry=HabetsHeintze1981(branch="primary"), cut=0.05)
+    population = Population.of(
+        star, multiplicity=model, photometry=HabetsHeintze1981(branch="primary"), cut=0.05
+    )
     law = population.law
     g, q_min = law.mass_ratio_exponent[0] + 1, law.mass_ratio_min[0]
 
@@ -59,13 +62,15 @@ def test_integrals_against_adaptive_quadrature(options):
         kink = (np.log10(0.05 * 700) - law.log_a[0]) / law.log_a_sigma[0]
         edges = [-9, *([kink] if kink < top else []), top]
         norm = quad(lambda z: np.exp(-0.5 * z * z), -9, top, epsrel=1e-12)[0]
-        pieces = zip(edges, edges[1:], strict=False)
+        pieces = itertools.pairwise(edges)
         return sum(quad(integrand, a, b, epsrel=1e-10)[0] for a, b in pieces) / norm
 
     integrals = integrate(population)
     assert integrals.unresolved[0] == pytest.approx(over_separation(0), rel=3e-5)
     assert integrals.mean[0, 0] == pytest.approx(over_mass_ratio(c2) * over_separation(2), rel=3e-5)
-    assert integrals.product[0, 0] == pytest.approx(over_mass_ratio(lambda q: c2(q) ** 2) * over_separation(4), rel=3e-5)
+    assert integrals.product[0, 0] == pytest.approx(
+        over_mass_ratio(lambda q: c2(q) ** 2) * over_separation(4), rel=3e-5
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -75,7 +80,9 @@ def test_the_quadrature_has_converged(stars, model, monkeypatch):
     nodes = np.polynomial.legendre.leggauss(1500)
     t = 0.25 * np.pi * (nodes[0] + 1)
     if model != "literal":
-        monkeypatch.setattr(prediction, "projection_nodes", lambda _: (np.cos(t), 0.25 * np.pi * nodes[1] * np.cos(t)))
+        monkeypatch.setattr(
+            prediction, "projection_nodes", lambda _: (np.cos(t), 0.25 * np.pi * nodes[1] * np.cos(t))
+        )
     monkeypatch.setattr(prediction, "_MASS_RATIO_PANELS", 2000)
     monkeypatch.setattr(prediction, "_DISTANCE_STEP", 0.002)
     fine = integrate(population)
@@ -93,12 +100,16 @@ def test_every_moment_of_every_order_against_the_engine(stars, model, fraction):
     population = Population.of(stars, multiplicity=MODELS[model], photometry=PHOTOMETRY["main-sequence"])
     moments = population_moments(population, integrate(population), np.array([fraction]))
     n_stars, n_stacks = 400, 5000
-    drawn = draw_stacks(population, n_stars=n_stars, binary_fraction=fraction, seed=11, first=0, last=n_stacks).moments.values
+    drawn = draw_stacks(
+        population, n_stars=n_stars, binary_fraction=fraction, seed=11, first=0, last=n_stacks
+    ).moments.values
     assert_within_sigma(drawn.mean(axis=0), moments.mean[0], drawn.std(axis=0) / np.sqrt(n_stacks))
     variance = drawn.var(axis=0) * n_stars
     centred = drawn - drawn.mean(axis=0)
     error = n_stars * np.sqrt(((centred**4).mean(axis=0) - drawn.var(axis=0) ** 2) / n_stacks)
-    low = [k for k, (a, b) in enumerate(INDICES) if a + b <= 4]  # higher orders have tails too heavy for this N
+    low = [
+        k for k, (a, b) in enumerate(INDICES) if a + b <= 4
+    ]  # higher orders have tails too heavy for this N
     assert_within_sigma(variance[low], moments.covariance[0].diagonal()[low], error[low])
 
 
@@ -162,7 +173,9 @@ def test_the_scatter_falls_as_the_root_of_n(population):
 def test_bias_and_scatter_against_simulated_stacks(population, estimator, n_stars):
     fraction, n_stacks = 0.35, 20_000
     moments = population_moments(population, integrate(population), np.array([fraction]))
-    stacks = draw_stacks(population, n_stars=n_stars, binary_fraction=fraction, seed=4, first=0, last=n_stacks)
+    stacks = draw_stacks(
+        population, n_stars=n_stars, binary_fraction=fraction, seed=4, first=0, last=n_stacks
+    )
     for psf in ("psf0", "psf1", "psf2"):
         reply = response(psf_from_name(psf), estimator_from_name(estimator))
         found = predict(moments, reply, n_stars)
@@ -180,7 +193,9 @@ def test_stars_integrated_in_parts_are_the_same(population, monkeypatch):
     whole = integrate(population)
     monkeypatch.setattr(prediction, "_CHUNK", 7)
     for field in dataclasses.fields(whole):
-        np.testing.assert_allclose(getattr(integrate(population), field.name), getattr(whole, field.name), rtol=1e-14)
+        np.testing.assert_allclose(
+            getattr(integrate(population), field.name), getattr(whole, field.name), rtol=1e-14
+        )
 
 
 def test_a_stack_needs_a_star(population):

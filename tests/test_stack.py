@@ -1,13 +1,13 @@
 import numba
 import numpy as np
 import pytest
-from statistics_helpers import assert_within_sigma
 
 from porrima.moments import INDICES
 from porrima.multiplicity import DucheneKraus2013
 from porrima.photometry import PHOTOMETRY, HabetsHeintze1981, flux_ratio
 from porrima.stack import draw_stacks, draw_systems
 from porrima.systems import Population
+from statistics_helpers import assert_within_sigma
 
 RUN = {"n_stars": 40, "binary_fraction": "uniform", "seed": 20261122}
 XX, XY, YY = (INDICES.index(i) for i in ((2, 0), (1, 1), (0, 2)))
@@ -85,7 +85,14 @@ def brute_force(population, photometry, rng, n):
     if population.projection != "isotropic":
         phase, tilt, node = 2 * np.pi * rng.random((3, n))
         u, v = np.cos(phase), np.sin(phase) * np.cos(tilt)
-        direction = np.stack([u * np.cos(node) - v * np.sin(node), u * np.sin(node) + v * np.cos(node), np.sin(phase) * np.sin(tilt)], 1)
+        direction = np.stack(
+            [
+                u * np.cos(node) - v * np.sin(node),
+                u * np.sin(node) + v * np.cos(node),
+                np.sin(phase) * np.sin(tilt),
+            ],
+            1,
+        )
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     x, y = (10**log_a / stars.distance[k] * direction[:, i] for i in (0, 1))
     tracks = photometry.tracks(stars.mass[k], stars.metallicity[k], stars.log_age[k], stars.band)
@@ -95,10 +102,17 @@ def brute_force(population, photometry, rng, n):
     return np.stack([c2 * x * x, c2 * x * y, c2 * y * y], axis=1)[kept]
 
 
-@pytest.mark.parametrize("photometry", [PHOTOMETRY["main-sequence"], HabetsHeintze1981(branch="primary")], ids=["ms", "hh"])
+@pytest.mark.parametrize(
+    "photometry", [PHOTOMETRY["main-sequence"], HabetsHeintze1981(branch="primary")], ids=["ms", "hh"]
+)
 @pytest.mark.parametrize(
     "options",
-    [{}, {"gap_rule": "solar", "a_max_factor": 2.5}, {"projection": "inclination-uniform", "mass_ratio_min": 0.3}, {"scatter_scale": 0.3}],
+    [
+        {},
+        {"gap_rule": "solar", "a_max_factor": 2.5},
+        {"projection": "inclination-uniform", "mass_ratio_min": 0.3},
+        {"scatter_scale": 0.3},
+    ],
     ids=["published", "kcm16", "literal", "narrow"],
 )
 def test_the_engine_draws_what_plain_numpy_draws(stars, options, photometry):

@@ -27,11 +27,15 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+_INTERRUPTED = 130  # what typer makes of Ctrl-C
+
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 Seed = Annotated[int, typer.Option("--seed", help="Of everything that is drawn.")]
 Longitude = Annotated[float | None, typer.Option("--l", help="Galactic longitude [deg].")]
 Latitude = Annotated[float | None, typer.Option("--b", help="Galactic latitude [deg].")]
-Catalogue = Annotated[Path | None, typer.Option("--catalog", help="A real catalogue instead of the analytic Galaxy.")]
+Catalogue = Annotated[
+    Path | None, typer.Option("--catalog", help="A real catalogue instead of the analytic Galaxy.")
+]
 Format = Annotated[str | None, typer.Option("--format", help="Of the catalogue; recognised when not given.")]
 Mapping = Annotated[str | None, typer.Option("--map", help="Its columns: mass=M,distance=D,magnitude=I.")]
 Band = Annotated[str | None, typer.Option("--band", help="Of the magnitudes; i, or the catalogue's own.")]
@@ -39,13 +43,15 @@ Mag = Annotated[tuple[float, float], typer.Option("--mag", help="Magnitude range
 MultiplicityName = Annotated[str, typer.Option("--multiplicity", help="dk13 or dk13-kcm16.")]
 PhotometryName = Annotated[str, typer.Option("--photometry", help="main-sequence or habets-heintze.")]
 Psf = Annotated[str, typer.Option("--psf", help="Name of the PSF.")]
-EstimatorName = Annotated[str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")]
+EstimatorName = Annotated[
+    str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")
+]
 
 
 @app.command()
 def stars(
     *,
-    l: Longitude = None,  # noqa: E741  (Galactic longitude)
+    l: Longitude = None,
     b: Latitude = None,
     area: Annotated[float, typer.Option(help="Solid angle to fill [deg²].")] = 1.0,
     catalog: Catalogue = None,
@@ -77,17 +83,28 @@ def stars(
         result,
         as_json,
         f"{len(selected)} stars, {selected.source}",
-        [selected.band, "stars", "per deg²", "median distance [pc]", "mean mass [M_sun]", "multiplicity fraction"],
+        [
+            selected.band,
+            "stars",
+            "per deg²",
+            "median distance [pc]",
+            "mean mass [M_sun]",
+            "multiplicity fraction",
+        ],
         table,
     )
 
 
 @app.command()
 def measure(
-    table: Annotated[Path, typer.Argument(help="Columns flux_ratio, dx, dy [arcsec] and, optionally, weight.")],
+    table: Annotated[
+        Path, typer.Argument(help="Columns flux_ratio, dx, dy [arcsec] and, optionally, weight.")
+    ],
     psf: Psf,
     estimator: EstimatorName = "adaptive",
-    method: Annotated[Literal["response", "images"], typer.Option(help="Moments, or GalSim images.")] = "response",
+    method: Annotated[
+        Literal["response", "images"], typer.Option(help="Moments, or GalSim images.")
+    ] = "response",
     as_json: Json = False,
 ) -> None:
     """Shape of one stack of the pairs in a table, and its change against the PSF without companions."""
@@ -108,12 +125,14 @@ def predict(
     catalog: Catalogue = None,
     format: Format = None,  # noqa: A002
     map: Mapping = None,  # noqa: A002
-    l: Longitude = None,  # noqa: E741
+    l: Longitude = None,
     b: Latitude = None,
     mag: Mag,
     psf: Psf,
     estimator: EstimatorName = "adaptive",
-    binary_fraction: Annotated[float | None, typer.Option(help="0 to 1; as the model gives it if not given.")] = None,
+    binary_fraction: Annotated[
+        float | None, typer.Option(help="0 to 1; as the model gives it if not given.")
+    ] = None,
     n_stars: Annotated[int | None, typer.Option(help="In the stack; infinitely many if not given.")] = None,
     multiplicity: MultiplicityName = "dk13",
     photometry: PhotometryName = "main-sequence",
@@ -123,14 +142,9 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Bias and error of the PSF's shape in closed form."""
-    import numpy as np
-
-    from porrima.prediction import QUANTITIES, integrate, population_moments
-    from porrima.prediction import predict as predicted
     from porrima.psf import psf_from_name
     from porrima.response import response
     from porrima.shapes import estimator_from_name
-    from porrima.simulation import draw_stars, population_of
 
     if stars is not None and catalog is not None:
         raise InputError("cannot be given together with --catalog", key="--stars", value=stars)
@@ -145,26 +159,8 @@ def predict(
         multiplicity=multiplicity, photometry=photometry, cut=cut,
     )  # fmt: skip
     reply = response(psf_from_name(psf), estimator_from_name(estimator))
-    population = population_of(config, draw_stars(config))
-    fraction = None if binary_fraction is None else np.array([binary_fraction])
-    moments = population_moments(population, integrate(population), fraction)
-    prediction = predicted(moments, reply, n_stars)
-    result: dict[str, Any] = {
-        "mean_x": moments.mean_x[0],
-        "mean_x2": moments.mean_x2[0],
-        "eta": prediction.eta[0],
-    }
-    for name in ("bias", "sigma", "sd"):
-        result |= {f"{name}_{q}": v for q, v in zip(QUANTITIES, getattr(prediction, name)[:, 0], strict=True)}
-    result |= {
-        "n_stars": n_stars,
-        "binary_fraction": binary_fraction,
-        "population_binary_fraction": moments.binary_fraction[0],
-        "unresolved_fraction": moments.unresolved_fraction[0],
-        "removed_fraction": moments.removed_fraction[0],
-        "n_catalog_stars": len(population.stars),
-    }
-    header = f"{len(population.stars)} stars, {psf}, {estimator}, {multiplicity}"
+    result = _predicted(config, reply, binary_fraction, n_stars)
+    header = f"{result['n_catalog_stars']} stars, {psf}, {estimator}, {multiplicity}"
     _show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
 
 
@@ -173,7 +169,9 @@ def simulate(
     config: Annotated[Path | None, typer.Argument(help="YAML file; see --example.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Zarr store to make.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
-    method: Annotated[Literal["moments", "images"], typer.Option(help="Moments, or GalSim images.")] = "moments",
+    method: Annotated[
+        Literal["moments", "images"], typer.Option(help="Moments, or GalSim images.")
+    ] = "moments",
     chunk: Annotated[int, typer.Option(help="Stacks per chunk.", min=1)] = 10_000,
     seed: Annotated[int | None, typer.Option("--seed", help="Instead of that of the configuration.")] = None,
     example: Annotated[bool, typer.Option("--example", help="Print a configuration.")] = False,
@@ -191,7 +189,7 @@ def simulate(
         raise InputError("is missing", key="--output")
     run = load(config)
     if seed is not None:
-        run = parse(RunConfig, run.model_dump() | {"seed": seed})
+        run = parse(RunConfig, run.model_dump(exclude_unset=True) | {"seed": seed})
     from porrima.simulation import simulate as simulated
 
     start = time.perf_counter()
@@ -232,7 +230,9 @@ def summary(
 
 @app.command()
 def paper(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for figures, tables and the report.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for figures, tables and the report.")
+    ],
     full: Annotated[bool, typer.Option("--full", help="At the paper's own number of stacks.")] = False,
     seed: Seed = 1,
     as_json: Json = False,
@@ -257,6 +257,22 @@ def paper(
     _show(result, as_json, f"report: {report}", ["quantity", "value"], [[k, v] for k, v in result.items()])
 
 
+@app.command()
+def bench(
+    n_stars: Annotated[int, typer.Option(help="In each stack.", min=1)] = 40,
+    n_stacks: Annotated[int, typer.Option(help="Of the engine.", min=1)] = 100_000,
+    seed: Seed = 1,
+    as_json: Json = False,
+) -> None:
+    """Stars per second, and the ratio to drawing each star with GalSim in the same run."""
+    from dataclasses import asdict
+
+    from porrima.bench import measure_speed
+
+    result = asdict(measure_speed(n_stars=n_stars, n_stacks=n_stacks, seed=seed))
+    _show(result, as_json, "speed", ["quantity", "value"], [[k, v] for k, v in result.items()])
+
+
 def main() -> None:
     """Run a command; wrong input ends in one line and exit code 2.
 
@@ -273,7 +289,9 @@ def main() -> None:
     except TyperException as error:
         code = _fail(error.format_message(), 2)
     except (KeyboardInterrupt, typer.Abort):
-        code = _fail("interrupted", 1)
+        code = _INTERRUPTED
+    if code == _INTERRUPTED:
+        code = _fail("interrupted; --resume goes on with a run", 1)
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -299,12 +317,46 @@ def _population_config(**options: Any) -> PopulationConfig:
     return parse(PopulationConfig, {"stars": stars} | rest)
 
 
+def _predicted(
+    config: PopulationConfig, reply: Any, binary_fraction: float | None, n_stars: int | None
+) -> dict[str, Any]:
+    """What `predict` shows."""
+    import numpy as np
+
+    from porrima.prediction import QUANTITIES, integrate, population_moments
+    from porrima.prediction import predict as predicted
+    from porrima.simulation import draw_stars, population_of
+
+    population = population_of(config, draw_stars(config))
+    fraction = None if binary_fraction is None else np.array([binary_fraction])
+    moments = population_moments(population, integrate(population), fraction)
+    prediction = predicted(moments, reply, n_stars)
+    errors = {
+        f"{name}_{quantity}": value
+        for name in ("bias", "sigma", "sd")
+        for quantity, value in zip(QUANTITIES, getattr(prediction, name)[:, 0], strict=True)
+    }
+    return {
+        "mean_x": moments.mean_x[0],
+        "mean_x2": moments.mean_x2[0],
+        "eta": prediction.eta[0],
+        **errors,
+        "n_stars": n_stars,
+        "binary_fraction": binary_fraction,
+        "population_binary_fraction": moments.binary_fraction[0],
+        "unresolved_fraction": moments.unresolved_fraction[0],
+        "removed_fraction": moments.removed_fraction[0],
+        "n_catalog_stars": len(population.stars),
+    }
+
+
 def _measured(systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, float]:
     """Shape of a stack and its change, as `measure` shows it."""
     import numpy as np
 
     from porrima.images import measure_stack
     from porrima.response import response
+    from porrima.shapes import Failure
     from porrima.systems import Systems
 
     zero = np.zeros(1)
@@ -312,15 +364,30 @@ def _measured(systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, 
 
     def shape(of: Systems) -> Any:
         if method == "images":
-            return measure_stack(psf, of, estimator)
-        return response(psf, estimator).shapes(of.kernel_moments())
+            found = measure_stack(psf, of, estimator)
+        else:
+            found = response(psf, estimator).shapes(of.kernel_moments())
+        flag = Failure(int(np.squeeze(found.flag)))
+        if flag & Failure.SERIES:
+            raise InputError(
+                "has pairs too wide for this PSF's kernel moments: use --method images", key="TABLE"
+            )
+        if flag:
+            raise InputError(f"gives a stack that cannot be measured ({flag.name})", key="TABLE")
+        return found
 
-    stack, single = ({q: float(np.squeeze(getattr(shape(s), q))) for q in ("e1", "e2", "r2")} for s in (systems, alone))
-    return stack | {f"{q}_0": v for q, v in single.items()} | {
-        "de1": stack["e1"] - single["e1"],
-        "de2": stack["e2"] - single["e2"],
-        "dr2_rel": stack["r2"] / single["r2"] - 1,
-    }
+    stack, single = (
+        {q: float(np.squeeze(getattr(shape(s), q))) for q in ("e1", "e2", "r2")} for s in (systems, alone)
+    )
+    return (
+        stack
+        | {f"{q}_0": v for q, v in single.items()}
+        | {
+            "de1": stack["e1"] - single["e1"],
+            "de2": stack["e2"] - single["e2"],
+            "dr2_rel": stack["r2"] / single["r2"] - 1,
+        }
+    )
 
 
 class _Progress:
@@ -331,7 +398,11 @@ class _Progress:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         self._bar = Progress(
-            BarColumn(), MofNCompleteColumn(), TextColumn(unit), TimeRemainingColumn(), console=Console(stderr=True)
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn(unit),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
         )
         self._task = self._bar.add_task(unit, total=total)
 
@@ -346,7 +417,9 @@ class _Progress:
         self._bar.stop()
 
 
-def _show(result: dict[str, Any], as_json: bool, header: str, columns: list[str], table: list[list[Any]]) -> None:
+def _show(
+    result: dict[str, Any], as_json: bool, header: str, columns: list[str], table: list[list[Any]]
+) -> None:
     """Print a result: one JSON object, or a header and a table."""
     if as_json:
         print(json.dumps(_plain(result), allow_nan=False))

@@ -39,10 +39,12 @@ class _Strict(BaseModel):
 class StarsConfig(_Strict):
     """Where the stars come from: the analytic Galaxy in a direction, or a catalogue."""
 
-    l: float | None = Field(default=None, ge=0, lt=360)  # noqa: E741  (Galactic longitude, deg)
+    l: float | None = Field(default=None, ge=0, lt=360)
     b: float | None = Field(default=None, ge=-90, le=90)  # Galactic latitude, deg
     n_drawn: int = Field(default=20_000, ge=1)  # stars drawn from the Galaxy in the magnitude range
-    area: float | None = Field(default=None, gt=0, le=41253)  # deg²: a Poisson number of stars fills it instead
+    area: float | None = Field(
+        default=None, gt=0, le=41253
+    )  # deg²: a Poisson number of stars fills it instead
     catalog: Path | None = None
     format: str | None = None
     map: dict[str, str] | None = None  # Porrima's column: the file's column
@@ -114,7 +116,9 @@ class Photometry(_Strict):
         if self.branch is None:
             return named
         if not isinstance(named, HabetsHeintze1981):
-            raise InputError("is an option of habets-heintze only", key="photometry.branch", value=self.branch)
+            raise InputError(
+                "is an option of habets-heintze only", key="photometry.branch", value=self.branch
+            )
         return dataclasses.replace(named, branch=self.branch)
 
 
@@ -258,11 +262,15 @@ def parse(model: type[Model], data: Any, source: Path | None = None) -> Model:
     try:
         return model.model_validate(data)
     except ValidationError as failure:
-        error = failure.errors(include_url=False)[0]
+        errors = failure.errors(include_url=False)
+        misspelt = [
+            e for e in errors if e["type"] == "extra_forbidden"
+        ]  # tells more than the key it stood for
+        error = (misspelt or errors)[0]
         location = [str(part) for part in error["loc"]]
         key = ".".join(location) or None
         if error["type"] == "extra_forbidden":
-            near = difflib.get_close_matches(location[-1], _keys(model, location[:-1]), n=1)
+            near = difflib.get_close_matches(location[-1], _keys(model, location[:-1]), n=1, cutoff=0.5)
             hint = f" (did you mean {near[0]}?)" if near else ""
             raise InputError(f"is not a key{hint}", source=source, key=key) from None
         if error["type"] == "missing":

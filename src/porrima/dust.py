@@ -60,7 +60,7 @@ class Place:
     height: FloatArray
 
     @classmethod
-    def towards(cls, l: float, b: float, distance: FloatArray) -> Place:  # noqa: E741
+    def towards(cls, l: float, b: float, distance: FloatArray) -> Place:
         """Places at some distances from the Sun in one direction.
 
         Parameters
@@ -175,7 +175,7 @@ def young_disc(
 
 
 def dust_extinction(
-    l: float,  # noqa: E741
+    l: float,
     b: float,
     distance: FloatArray,
     per_kpc: float,

@@ -13,7 +13,14 @@ if TYPE_CHECKING:
 
 __all__ = ["errors_and_biases"]
 
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe & Ito, safe for all eyes
+_COLOURS = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+)  # Okabe & Ito, safe for all eyes
 _MARKERS = ("o", "s", "^", "D", "v", "P")
 _PANELS = (
     ("r2", r"$\sigma(R^2)/R_0^2$", r"$\langle\delta R^2\rangle/R_0^2$"),
@@ -31,7 +38,9 @@ _STYLE = {
 }
 
 
-def errors_and_biases(summary: xr.Dataset, curves: xr.Dataset, limit: xr.Dataset, requirement: Requirement) -> Figure:
+def errors_and_biases(
+    summary: xr.Dataset, curves: xr.Dataset, limit: xr.Dataset, requirement: Requirement
+) -> Figure:
     """Six panels: error and bias of R², e1 and e2 against binary fraction (KCM16, Fig. 4).
 
     Parameters

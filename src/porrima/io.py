@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from porrima.tables import column_values, load_table, open_catalog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from pathlib import Path
 
 __all__ = ["make_folder", "read_systems", "write_rows", "write_whole"]
 
@@ -45,7 +45,9 @@ def read_systems(path: Path) -> Systems:
         if name in table.colnames:
             values[name] = column_values(path, table[name], name, unit, row)
         elif name != "weight":
-            raise InputError(f"is missing; the table has {', '.join(table.colnames)}", source=path, column=name)
+            raise InputError(
+                f"is missing; the table has {', '.join(table.colnames)}", source=path, column=name
+            )
     values.setdefault("weight", np.ones(len(table)))
     if not len(table):
         raise InputError("must have rows below its header", source=path)

@@ -86,7 +86,10 @@ def pair_coefficient(flux_ratio: FloatArray, order: int) -> FloatArray:
     """
     primary = 1.0 / (1.0 + flux_ratio)
     companion = flux_ratio * primary
-    near, far = primary * -companion, companion * primary  # by products: numpy's powers take ten times as long
+    near, far = (
+        primary * -companion,
+        companion * primary,
+    )  # by products: numpy's powers take ten times as long
     for _ in range(order - 1):
         near, far = near * -companion, far * primary
     return near + far

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 
 from porrima.photometry import check_masses
 
@@ -212,13 +211,19 @@ def multiplicity_scale(multiplicity_fraction: FloatArray, binary_fraction: Float
     """
     wanted = np.asarray(binary_fraction, dtype=float)
     if np.any((wanted < 0) | (wanted > 1) | ~np.isfinite(wanted)):
-        raise ValueError(f"binary_fraction must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}")
+        raise ValueError(
+            f"binary_fraction must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}"
+        )
     ascending = np.sort(multiplicity_fraction)
     values, first = np.unique(ascending, return_index=True)
     values, first = values[values > 0], first[values > 0]
     sum_below = np.concatenate([[0.0], np.cumsum(ascending)])[first]
-    reached = np.concatenate([[0.0], ((sum_below / values + (ascending.size - first)) / ascending.size)[::-1]])
+    reached = np.concatenate(
+        [[0.0], ((sum_below / values + (ascending.size - first)) / ascending.size)[::-1]]
+    )
     if np.any(wanted > reached[-1] * (1 + 1e-12)):
-        raise ValueError(f"binary_fraction must be at most {reached[-1]:.6g} for these stars, got {wanted.max()}")
+        raise ValueError(
+            f"binary_fraction must be at most {reached[-1]:.6g} for these stars, got {wanted.max()}"
+        )
     scale: FloatArray = np.interp(wanted, reached, np.concatenate([[0.0], 1.0 / values[::-1]]))
     return scale

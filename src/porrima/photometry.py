@@ -401,7 +401,9 @@ def _main_sequence_grid(band: str) -> tuple[FloatArray, FloatArray, FloatArray, 
 
 
 def _continued(
-    track: tuple[FloatArray, FloatArray], left: tuple[FloatArray, FloatArray], right: tuple[FloatArray, FloatArray]
+    track: tuple[FloatArray, FloatArray],
+    left: tuple[FloatArray, FloatArray],
+    right: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray]:
     """The track, continued above its last mass by the mean of two others, without a step."""
     mass, magnitude = track

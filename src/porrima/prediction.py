@@ -189,7 +189,9 @@ def _separation_moments(population: Population) -> dict[int, FloatArray]:
     return moments
 
 
-def _log_separation_moments(population: Population, law: FloatArray, log_distance: FloatArray) -> dict[int, FloatArray]:
+def _log_separation_moments(
+    population: Population, law: FloatArray, log_distance: FloatArray
+) -> dict[int, FloatArray]:
     """Log of E[r^k; r < cut] for one law of the semi-major axis at each log10 distance."""
     rho, weight = projection_nodes(population.projection)
     mu, s, largest = law * math.log(10)

@@ -13,7 +13,7 @@ from porrima.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["EXTENT_PER_FWHM", "GRID_SCALE", "GSPARAMS", "PSF", "PSFS", "psf_from_name"]
+__all__ = ["EXTENT_PER_FWHM", "GRID_SCALE", "GSPARAMS", "PSF", "PSFS", "psf_from_name", "sheared_gaussian"]
 
 GRID_SCALE = 0.1 / 12
 """Coarsest grid on which a PSF is drawn, in arcsec: a VIS pixel sampled 12 times finer (KCM16)."""

@@ -102,7 +102,11 @@ def _page(numbers: ErrorsAndBiases, figure: Figure) -> str:
     svg = io.StringIO()
     figure.savefig(svg, format="svg", metadata=_NO_DATE["svg"])
     where = config.stars
-    stars = f"l = {where.l:g}°, b = {where.b:g}° of the analytic Galaxy" if where.catalog is None else str(where.catalog)
+    stars = (
+        f"l = {where.l:g}°, b = {where.b:g}° of the analytic Galaxy"
+        if where.catalog is None
+        else str(where.catalog)
+    )
     return _PAGE.format(
         answer=_answer(numbers),
         figure=svg.getvalue()[svg.getvalue().index("<svg") :],
@@ -142,7 +146,9 @@ def _agreement(summary: xr.Dataset) -> str:
 
 def _table(summary: xr.Dataset) -> str:
     names = ("bias", "bias_se", "prediction_bias", "sigma", "sigma_se", "prediction_sigma")
-    head = "".join(f"<th scope='col'>{n}</th>" for n in ("PSF", "quantity", "binary fraction", "stacks", *names))
+    head = "".join(
+        f"<th scope='col'>{n}</th>" for n in ("PSF", "quantity", "binary fraction", "stacks", *names)
+    )
     body = "".join(
         f"<tr><td>{escape(row['psf'])}</td><td>{row['quantity']}</td>"
         f"<td>{row['f_lo']:.2f}–{row['f_hi']:.2f}</td><td>{row['n_stacks']}</td>"
@@ -150,4 +156,5 @@ def _table(summary: xr.Dataset) -> str:
         + "</tr>\n"
         for row in rows(summary)
     )
-    return f"<table><caption>Per PSF, quantity and bin</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    caption = "<caption>Per PSF, quantity and bin</caption>"
+    return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

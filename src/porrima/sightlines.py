@@ -1,4 +1,4 @@
-"""One direction of the Galaxy in cells of distance: the stars that each cell shows, and stars drawn from them."""
+"""One direction of the Galaxy in cells of distance: the stars that each shows, and stars drawn from them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Sightline:
         Integral of d² times density over that at the Sun, in pc³ per deg².
     """
 
-    l: float  # noqa: E741
+    l: float
     b: float
     distance: FloatArray
     extinction: FloatArray
@@ -58,7 +58,7 @@ class Sightline:
 
 
 def sightline(
-    l: float,  # noqa: E741
+    l: float,
     b: float,
     band: str,
     brightest: float,

@@ -75,21 +75,20 @@ def draw_stars(config: PopulationConfig) -> Stars:
     InputError
         If the catalogue is wrong or no star is left.
     """
-    if config.stars.catalog is not None:
-        from porrima.catalogs import read_catalog  # noqa: PLC0415  (astropy's readers, where used)
-
-        catalog = read_catalog(
-            config.stars.catalog, format=config.stars.format, columns=config.stars.map, band=config.stars.band
-        )
-        stars = catalog.stars
-    else:
+    where = config.stars
+    if where.l is not None and where.b is not None:
         from porrima.galaxy import Robin2003  # noqa: PLC0415  (the Galaxy's tables, where used)
 
-        rng = np.random.Generator(np.random.Philox(np.random.SeedSequence(config.seed, spawn_key=(_GALAXY_STREAM,))))
-        where = config.stars
-        stars = Robin2003().draw(
-            where.l, where.b, where.area or 1.0, where.band or "i", where.mag, rng, n=None if where.area else where.n_drawn
-        )
+        sequence = np.random.SeedSequence(config.seed, spawn_key=(_GALAXY_STREAM,))
+        rng = np.random.Generator(np.random.Philox(sequence))
+        n = None if where.area else where.n_drawn
+        stars = Robin2003().draw(where.l, where.b, where.area or 1.0, where.band or "i", where.mag, rng, n=n)
+    elif where.catalog is not None:
+        from porrima.catalogs import read_catalog  # noqa: PLC0415  (astropy's readers, where used)
+
+        stars = read_catalog(where.catalog, format=where.format, columns=where.map, band=where.band).stars
+    else:
+        raise InputError("must have either l and b, or catalog", key="stars")
     selected = stars.select(magnitude=config.stars.mag, mass_max=BRIGHT_MASS)
     if len(selected) == 0:
         low, high = config.stars.mag
@@ -198,7 +197,9 @@ def open_run(path: Path) -> tuple[xr.Dataset, RunConfig, Population]:
     chunk = dataset["binary_fraction"].encoding["chunks"][0]
     missing = [n for n in range(-(-dataset.sizes["stack"] // chunk)) if not _is_written(path, n)]
     if missing:
-        raise InputError(f"is not complete ({len(missing)} chunks missing): run again with --resume", source=path)
+        raise InputError(
+            f"is not complete ({len(missing)} chunks missing): run again with --resume", source=path
+        )
     stars = Stars.from_columns(
         **{name: dataset[f"star_{name}"].to_numpy() for name in _STAR_COLUMNS}, band=dataset.attrs["band"]
     )
@@ -276,7 +277,9 @@ class _Run:
 
         zero = np.zeros(1)
         return measure_stack(
-            psf_from_name(psf), Systems.from_pairs(zero, zero, zero), estimator_from_name(self.config.estimator)
+            psf_from_name(psf),
+            Systems.from_pairs(zero, zero, zero),
+            estimator_from_name(self.config.estimator),
         )
 
     @property
@@ -291,14 +294,18 @@ class _Run:
 def _open_or_create(run: _Run, path: Path, resume: bool, chunk: int) -> Any:
     if path.exists():
         if not resume:
-            raise InputError("exists already; go on with it by --resume, or choose another", key="output", value=path)
+            raise InputError(
+                "exists already; go on with it by --resume, or choose another", key="output", value=path
+            )
         try:
             store = zarr.open_group(path, mode="r+")
             identity = store.attrs["identity"]
         except (OSError, KeyError, ValueError):
             raise InputError("is not a run of porrima simulate", key="output", value=path) from None
         if identity != run.identity:
-            raise InputError("holds a run of another configuration, stars or version", key="output", value=path)
+            raise InputError(
+                "holds a run of another configuration, stars or version", key="output", value=path
+            )
         return store
     parent = path.parent if str(path.parent) else path
     if not parent.is_dir() or not os.access(parent, os.W_OK):

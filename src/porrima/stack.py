@@ -107,9 +107,7 @@ def draw_stacks(
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(last - first)
     sums = np.zeros((last - first, N_MOMENTS))
     _fill(_tables(population), np.uint64(seed), first, n_stars, fractions, scale, sums)
-    return Stacks(
-        binary_fraction=fractions, moments=KernelMoments(values=sums / n_stars, n_stars=n_stars)
-    )
+    return Stacks(binary_fraction=fractions, moments=KernelMoments(values=sums / n_stars, n_stars=n_stars))
 
 
 def draw_systems(
@@ -143,7 +141,15 @@ def draw_systems(
     pairs = np.zeros((n_stars, 3))
     scratch = np.empty((2, N_MOMENTS))
     _draw_stack(
-        _tables(population), np.uint64(seed), stack, n_stars, fractions[0], scale[0], scratch[0], scratch[1], pairs
+        _tables(population),
+        np.uint64(seed),
+        stack,
+        n_stars,
+        fractions[0],
+        scale[0],
+        scratch[0],
+        scratch[1],
+        pairs,
     )
     return Systems.from_pairs(*pairs.T)
 
@@ -310,5 +316,13 @@ def _draw_stack(tables, seed, stack, n_stars, fraction, scale, sums, powers, pai
 def _fill(tables, seed, first, n_stars, fractions, scale, sums):  # type: ignore[no-untyped-def]
     for s in prange(fractions.size):
         _draw_stack(
-            tables, seed, first + s, n_stars, fractions[s], scale[s], sums[s], np.empty(N_MOMENTS), np.empty((0, 3))
+            tables,
+            seed,
+            first + s,
+            n_stars,
+            fractions[s],
+            scale[s],
+            sums[s],
+            np.empty(N_MOMENTS),
+            np.empty((0, 3)),
         )

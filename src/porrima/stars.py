@@ -14,7 +14,19 @@ if TYPE_CHECKING:
 
 __all__ = ["COMPONENTS", "Stars"]
 
-COMPONENTS = ("thin1", "thin2", "thin3", "thin4", "thin5", "thin6", "thin7", "thick", "halo", "bulge", "unknown")
+COMPONENTS = (
+    "thin1",
+    "thin2",
+    "thin3",
+    "thin4",
+    "thin5",
+    "thin6",
+    "thin7",
+    "thick",
+    "halo",
+    "bulge",
+    "unknown",
+)
 """Names of the Galaxy's components, as in Robin et al. (2003); ``unknown`` where a catalogue does not say."""
 
 _DEFAULTS: dict[str, float] = {"metallicity": 0.0, "log_age": 9.7}  # the Sun's, where a catalogue gives none
@@ -135,8 +147,8 @@ class Stars:
 
         Parameters
         ----------
-        index : array
-            Integers or booleans, as numpy takes them (dimensionless).
+        index : (k,) int array or (n,) bool array
+            Numbers of the stars, or a mask, dimensionless.
 
         Returns
         -------
@@ -185,7 +197,9 @@ class Stars:
             keep &= self.component == component
         return self.take(keep)
 
-    def counts(self, magnitude: tuple[float, float], multiplicity_fraction: FloatArray) -> list[dict[str, Any]]:
+    def counts(
+        self, magnitude: tuple[float, float], multiplicity_fraction: FloatArray
+    ) -> list[dict[str, Any]]:
         """Number and mean properties of the stars per magnitude.
 
         Parameters

@@ -140,7 +140,7 @@ def summarise(run: xr.Dataset, config: RunConfig, population: Population, bins: 
     if bins < 1:
         raise ValueError(f"bins must be at least 1, got {bins}")
     fraction = run["binary_fraction"].to_numpy()
-    edges = np.linspace(0.0, 1.0, bins + 1)
+    edges = np.arange(bins + 1) / bins  # so that 0.35 is an edge of 20 bins
     which = np.clip(np.searchsorted(edges, fraction, side="right") - 1, 0, bins - 1)
     curves = _at_stacks(population, config, fraction)
     out = {name: np.full((len(config.psf), len(QUANTITIES), bins), np.nan) for name in STATISTICS}
@@ -204,7 +204,9 @@ def _at_stacks(population: Population, config: RunConfig, fraction: FloatArray) 
     curves = predicted_curves(population, config, config.n_stars, grid)
     nodes = curves["binary_fraction"].to_numpy()
     return {
-        name: np.stack([[np.interp(fraction, nodes, line) for line in psf] for psf in curves[name].to_numpy()])
+        name: np.stack(
+            [[np.interp(fraction, nodes, line) for line in psf] for psf in curves[name].to_numpy()]
+        )
         for name in ("bias", "sd")
     }
 

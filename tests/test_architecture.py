@@ -1,0 +1,152 @@
+"""Arrows point one way, docstrings are whole, files stay small: the rules that no reviewer should have to repeat."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src" / "porrima"
+UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the architecture diagram.
+    "units": set(),
+    "errors": set(),
+    "instruments": set(),
+    "streams": set(),
+    "moments": set(),
+    "orbits": set(),
+    "photometry": set(),
+    "stars": set(),
+    "dust": set(),
+    "tables": {"errors"},
+    "besancon": {"errors", "stars", "tables"},
+    "catalogs": {"besancon", "errors", "stars", "tables"},
+    "populations": {"dust", "photometry"},
+    "sightlines": {"dust", "photometry", "populations", "stars"},
+    "galaxy": {"dust", "photometry", "populations", "sightlines", "stars"},
+    "multiplicity": {"orbits", "photometry"},
+    "systems": {"errors", "moments", "multiplicity", "orbits", "photometry", "stars"},
+    "psf": {"errors"},
+    "shapes": {"errors"},
+    "weighted": {"moments", "psf"},
+    "response": {"moments", "psf", "shapes", "weighted"},
+    "images": {"psf", "shapes", "systems"},
+    "stack": {"moments", "orbits", "photometry", "streams", "systems"},
+    "prediction": {"moments", "orbits", "photometry", "response", "systems"},
+    "config": {"errors", "multiplicity", "photometry"},
+    "simulation": {
+        "catalogs", "config", "errors", "galaxy", "images", "moments", "psf", "response", "shapes", "stack", "stars",
+        "systems",
+    },
+    "summary": {"config", "prediction", "psf", "response", "shapes", "systems"},
+    "io": {"errors", "systems", "tables"},
+    "experiments": {"config", "prediction", "simulation", "summary"},
+    "figures": {"instruments"},
+    "report": {"experiments", "figures", "instruments", "io", "summary"},
+    "bench": {"images", "moments", "psf", "response", "shapes", "simulation", "config", "stack", "systems"},
+    "cli": {
+        "bench", "catalogs", "config", "errors", "experiments", "images", "io", "prediction", "psf", "report",
+        "response", "shapes", "simulation", "summary", "systems",
+    },
+}  # fmt: skip
+NEVER_REACHED = {  # followed through every module in between
+    "prediction": {"stack", "simulation"},
+    "images": {"response", "weighted", "stack", "prediction"},
+    "stack": {"prediction", "response", "psf"},
+    "figures": {"prediction", "stack", "simulation", "summary"},
+}
+UNIT = re.compile(
+    r"arcsec|deg\b|deg²|rad\b|\bpc\b|\bau\b|mag\b|M_sun|\byr\b|dex|pixel|in \[0, 1\]|in \(0, 1|dimensionless|\(count\)"
+    r"|file's unit|unit of the"
+)
+MODULES = sorted(p for p in SOURCE.glob("*.py") if not p.stem.startswith("__"))
+
+
+def siblings_imported(tree):
+    names = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module}
+    names |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+    return {n.split(".")[1] for n in names if n.startswith("porrima.")}
+
+
+def reach(name, table):
+    seen, todo = set(), [name]
+    while todo:
+        new = table.get(todo.pop(), set()) - seen
+        seen |= new
+        todo += new
+    return seen
+
+
+def is_compiled(node):
+    """Compiled scalar functions say in one line what they take; their arguments have no types to check."""
+    return any("njit" in ast.unparse(d) for d in node.decorator_list)
+
+
+def incomplete(node):
+    doc = ast.get_docstring(node) or ""
+    every = [*node.args.args, *node.args.kwonlyargs]
+    arguments = [a.arg for a in every if a.arg not in ("self", "cls", "rng")]
+    arrays = [a for a in every if a.annotation and "Array" in ast.unparse(a.annotation)]
+    missing = [] if doc else ["docstring"]
+    if arrays:
+        missing += [] if re.search(r"\(\w.*\) (float|int|bool) array", doc) else ["shape"]
+        missing += [] if UNIT.search(doc) else ["unit"]
+    if arguments and "Parameters\n---" in doc:
+        missing += [] if "Returns\n---" in doc else ["Returns"]
+        missing += [f"parameter {a}" for a in arguments if not re.search(rf"\b{a}\b", doc)]
+    elif arguments and len(doc.splitlines()) != 1:
+        missing += ["Parameters"]
+    if any(isinstance(n, ast.Raise) for n in ast.walk(node)) and "Raises\n---" not in doc:
+        missing.append("Raises")
+    return missing
+
+
+def public_functions(tree):
+    """Functions of the module and methods of its public classes; methods of a protocol may be one line."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_") and not is_compiled(node):
+            yield node
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield from (n for n in node.body if isinstance(n, ast.FunctionDef) and not n.name.startswith("_"))
+
+
+def test_the_table_names_every_module():
+    assert {p.stem for p in MODULES} == set(UPSTREAM)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: p.stem)
+def test_module_imports_only_from_upstream(path):
+    assert siblings_imported(ast.parse(path.read_text(encoding="utf-8"))) <= UPSTREAM[path.stem]
+
+
+def test_no_arrow_comes_back():
+    assert not [name for name in UPSTREAM if name in reach(name, UPSTREAM)]
+
+
+@pytest.mark.parametrize("name", NEVER_REACHED)
+def test_theory_never_sees_the_simulation(name):
+    assert not reach(name, UPSTREAM) & NEVER_REACHED[name]
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if p.stem != "cli"], ids=lambda p: p.stem)
+def test_public_docstrings_are_whole(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    assert not {n.name: incomplete(n) for n in public_functions(tree) if incomplete(n)}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: p.stem)
+def test_modules_and_functions_stay_small(path):
+    text = path.read_text(encoding="utf-8")
+    assert text.count("\n") <= 500
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            doc = ast.get_docstring(node, clean=False) or ""
+            assert node.end_lineno - node.lineno - doc.count("\n") <= 60, node.name
+
+
+def test_the_rules_catch_what_they_should():
+    node = ast.parse(
+        "def f(x: FloatArray):\n    '''Short.\n\n    Parameters\n    ---\n    '''\n    raise ValueError"
+    ).body[0]
+    assert set(incomplete(node)) == {"shape", "unit", "Returns", "Raises", "parameter x"}
+    assert incomplete(ast.parse("def f(x: int):\n    pass").body[0]) == ["docstring", "Parameters"]
+    assert reach("prediction", {"prediction": {"response"}, "response": {"stack"}}) == {"response", "stack"}

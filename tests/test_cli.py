@@ -1,0 +1,263 @@
+"""The commands as a user types them: JSON keys of the contract, one line and exit code 2 for wrong input."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from porrima import cli
+from porrima.catalogs import read_catalog
+
+PREDICT_KEYS = {
+    "mean_x", "mean_x2", "eta", "bias_e1", "bias_e2", "bias_r2", "sigma_e1", "sigma_e2", "sigma_r2", "sd_e1", "sd_e2",
+    "sd_r2", "n_stars", "binary_fraction", "unresolved_fraction", "removed_fraction",
+}  # fmt: skip
+CONFIG = "stars: {{catalog: {stars}, mag: [18, 19]}}\nn_stacks: 500\nn_stars: 10\nestimator: plain\n"
+
+
+@pytest.fixture
+def porrima(monkeypatch, capsys):
+    """Run a command in this process; gives exit code, standard output and standard error."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["porrima", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        out, err = capsys.readouterr()
+        return stop.value.code, out, err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def stars_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cli") / "stars.ecsv"
+    rng = np.random.Generator(np.random.Philox(8))
+    lines = [
+        f"{m},{d},{i}"
+        for m, d, i in zip(
+            rng.uniform(0.1, 1.4, 60), rng.uniform(100, 4e3, 60), rng.uniform(18, 20, 60), strict=True
+        )
+    ]
+    path = path.with_suffix(".csv")
+    path.write_text("mass,distance,magnitude\n" + "\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture
+def config(tmp_path, stars_file):
+    path = tmp_path / "run.yaml"
+    path.write_text(CONFIG.format(stars=stars_file))
+    return path
+
+
+def test_stars_of_the_galaxy(porrima, tmp_path):
+    code, out, _ = porrima(
+        "stars", "--l", 180, "--b", 45, "--area", 0.3, "--mag", 17, 19.5, "-o", tmp_path / "s.ecsv", "--json"
+    )
+    result = json.loads(out)
+    assert code == 0
+    assert set(result) == {"n", "area_deg2", "counts"}
+    assert result["area_deg2"] == 0.3
+    assert [(c["mag_lo"], c["mag_hi"]) for c in result["counts"]] == [(17, 18), (18, 19), (19, 19.5)]
+    assert set(result["counts"][0]) == {
+        "mag_lo", "mag_hi", "n", "n_per_deg2", "median_distance_pc", "mean_mass", "mean_multiplicity_fraction",
+    }  # fmt: skip
+    back = read_catalog(tmp_path / "s.ecsv").stars
+    assert len(back) == result["n"] == sum(c["n"] for c in result["counts"])
+
+
+def test_a_seed_gives_the_same_stars(porrima):
+    one, same, other = (
+        porrima("stars", "--l", 180, "--b", 45, "--area", 0.1, "--mag", 18, 19, "--seed", s, "--json")[1]
+        for s in (1, 1, 2)
+    )
+    assert one == same != other
+
+
+def test_stars_of_a_catalogue_are_summarised(porrima, stars_file):
+    code, out, _ = porrima("stars", "--catalog", stars_file, "--mag", 18, 19, "--json")
+    result = json.loads(out)
+    assert code == 0
+    assert result["area_deg2"] is None
+    assert result["counts"][0]["n_per_deg2"] is None
+
+
+@pytest.mark.parametrize("estimator", ["adaptive", "plain", "gaussian:0.1"])
+def test_measure_by_response_and_by_images(porrima, tmp_path, estimator):
+    table = tmp_path / "pairs.csv"
+    table.write_text("flux_ratio,dx,dy\n0.5,0.01,0.02\n0,0,0\n1.0,0.03,-0.02\n")
+    results = {}
+    for method in ("response", "images"):
+        code, out, _ = porrima(
+            "measure", table, "--psf", "psf1", "--estimator", estimator, "--method", method, "--json"
+        )
+        assert code == 0
+        results[method] = json.loads(out)
+        assert set(results[method]) == {"e1", "e2", "r2", "e1_0", "e2_0", "r2_0", "de1", "de2", "dr2_rel"}
+    for name in ("de1", "de2", "dr2_rel"):
+        assert abs(results["response"][name] - results["images"][name]) < 1e-4 * results["images"]["dr2_rel"]
+
+
+def test_predict_has_the_keys_of_the_contract(porrima, stars_file):
+    code, out, _ = porrima("predict", "--stars", stars_file, "--mag", 18, 19, "--psf", "psf1", "--json")
+    result = json.loads(out)
+    assert code == 0
+    assert set(result) >= PREDICT_KEYS
+    assert result["n_stars"] is None
+    assert result["binary_fraction"] is None
+    assert result["sd_r2"] == 0
+    assert result["sigma_e1"] == pytest.approx(abs(result["bias_e1"]))
+    code, out, _ = porrima(
+        "predict", "--catalog", stars_file, "--mag", 18, 19, "--psf", "psf1", "--binary-fraction", 0.35, "--n-stars",
+        40, "--estimator", "plain", "--multiplicity", "dk13-kcm16", "--photometry", "habets-heintze", "--json",
+    )  # fmt: skip
+    result = json.loads(out)
+    assert result["binary_fraction"] == 0.35
+    assert result["n_stars"] == 40
+    assert result["eta"] == pytest.approx(result["mean_x"] / 6.77941e-3, rel=1e-5)
+    assert result["bias_r2"] == pytest.approx(result["eta"])
+    assert result["sigma_r2"] == pytest.approx(np.hypot(result["bias_r2"], result["sd_r2"]))
+
+
+def test_predict_from_the_galaxy(porrima):
+    code, out, _ = porrima("predict", "--l", 180, "--b", 45, "--mag", 18, 19, "--psf", "psf0", "--json")
+    assert code == 0
+    assert 0.1 < json.loads(out)["removed_fraction"] < 0.3
+
+
+def test_simulate_and_summary(porrima, config, tmp_path):
+    store = tmp_path / "run.zarr"
+    code, out, err = porrima("simulate", config, "-o", store, "--json")
+    assert code == 0, err
+    result = json.loads(out)
+    assert set(result) >= {"n_stacks", "n_stars", "wall_s", "stars_per_s"}
+    assert (result["n_stacks"], result["n_stars"]) == (500, 10)
+    code, out, _ = porrima("simulate", config, "-o", store, "--resume", "--json")
+    assert json.loads(out)["n_stacks_computed"] == 0
+    code, out, _ = porrima("summary", store, "--bins", 2, "-o", tmp_path / "bins.ecsv", "--json")
+    assert code == 0
+    bins = json.loads(out)["bins"]
+    assert len(bins) == 3 * 3 * 2
+    assert sum(b["n_stacks"] for b in bins if b["psf"] == "psf0" and b["quantity"] == "r2") == 500
+    assert (tmp_path / "bins.ecsv").exists()
+
+
+def test_a_seed_on_the_command_line_wins(porrima, config, tmp_path):
+    porrima("simulate", config, "-o", tmp_path / "run.zarr", "--seed", 77)
+    assert json.loads(xr.open_zarr(tmp_path / "run.zarr").attrs["config"])["seed"] == 77
+
+
+def test_the_example_configuration_can_be_run(porrima, tmp_path):
+    code, out, _ = porrima("simulate", "--example")
+    path = tmp_path / "example.yaml"
+    path.write_text(out.replace("n_stacks: 100000", "n_stacks: 100"))
+    assert code == 0
+    assert porrima("simulate", path, "-o", tmp_path / "run.zarr")[0] == 0
+
+
+def test_tables_are_printed_without_json(porrima, stars_file):
+    code, out, _ = porrima("predict", "--stars", stars_file, "--mag", 18, 19, "--psf", "psf1")
+    assert code == 0
+    assert "mean_x" in out
+
+
+PREDICT = ["predict", "--stars", "{stars}", "--mag", "18", "19", "--psf", "psf1"]
+GALAXY = ["stars", "--l", "180", "--b", "45"]
+WRONG = [  # arguments, what the one line says
+    (["stars", "--catalog", "{missing_column}"], "missing.csv, column distance: must be in the table"),
+    (["stars", "--catalog", "{truncated}"], "truncated.csv, row 3"),
+    (["stars", "--catalog", "{nan_mass}"], "nan.csv, row 3, column mass"),
+    (["stars", "--catalog", "{negative}"], "negative.csv, row 2, column distance"),
+    (["stars", "--catalog", "{stars}", "--mag", "1", "2"], "with magnitude in [1.0, 2.0)"),
+    (["stars", "--catalog", "absent.csv"], "absent.csv: must be a readable file"),
+    (["stars", "--mag", "18", "19"], "must have either l and b, or catalog"),
+    (["stars", "--l", "180", "--b", "95"], "b: must be less than or equal to 90, got 95"),
+    ([*GALAXY, "--mag", "18"], "--mag"),
+    ([*GALAXY, "--area", "0.01", "--mag", "18", "19", "-o", "nowhere/s.ecsv"], "nowhere/s.ecsv"),
+    (["stars", "--catalog", "{stars}", "--map", "mass"], "--map: must be column=name,column=name, got mass"),
+    (["stars", "--catalog", "{stars}", "--format", "trileg"], "format: must be one of besancon, table"),
+    (["predict", "--stars", "{stars}", "--mag", "18", "19", "--psf", "psf9"], "psf: must be one of psf0, psf1, psf2"),
+    ([*PREDICT, "--binary-fraction", "1.2"], "--binary-fraction: must be in [0, 1], got 1.2"),
+    ([*PREDICT, "--n-stars", "0"], "--n-stars: must be at least 1, got 0"),
+    ([*PREDICT, "--cut", "0"], "cut: must be greater than 0"),
+    ([*PREDICT, "--multiplicity", "dk12"], "dk13-kcm16 (did you mean dk13"),
+    ([*PREDICT, "--band", "J"], "band must be one of"),
+    (["predict", "--stars", "{stars}", "--psf", "psf1"], "--mag"),
+    (["measure", "{pairs}", "--psf", "psf1"], "pairs.csv, row 2, column flux_ratio: must be in [0, 1], got 2"),
+    (["measure", "{wide}", "--psf", "psf1"], "use --method images"),
+    (["measure", "{wide}", "--psf", "psf1", "--estimator", "gaussian:x"], "estimator"),
+    (["simulate", "{config}", "-o", "nowhere/run.zarr"], "output: must lie in a folder that can be written"),
+    (["simulate", "{config}"], "--output: is missing"),
+    (["simulate", "{misspelt}", "-o", "run.zarr"], "n_star: is not a key (did you mean n_stars?)"),
+    (["simulate", "{impossible}", "-o", "run.zarr"], "binary_fraction: must be in [0, 1], uniform or model, got 1.2"),
+    (["simulate", "{none}", "-o", "run.zarr"], "n_stars: must be greater than or equal to 1, got 0"),
+    (["simulate", "{unknown_psf}", "-o", "run.zarr"], "psf: must be one of psf0, psf1, psf2"),
+    (["summary", "absent.zarr"], "absent.zarr: is not a run of porrima simulate"),
+    (["summary", "{config}"], "is not a run of porrima simulate"),
+    (["paper", "-o", "{stars}"], "output: cannot be made"),
+    (["predikt"], "predikt"),
+    (["stars", "--bnad", "i"], "--bnad"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), WRONG, ids=lambda v: " ".join(v)[:60] if isinstance(v, list) else ""
+)
+def test_wrong_input_gives_one_line_and_writes_nothing(
+    porrima, tmp_path, monkeypatch, stars_file, arguments, message
+):
+    files = {
+        "missing_column": ("missing.csv", "mass,magnitude\n0.5,18.5\n"),
+        "truncated": ("truncated.csv", "mass,distance,magnitude\n0.5,100,18.5\n0.5,10"),
+        "nan_mass": ("nan.csv", "mass,distance,magnitude\n0.5,100,18.5\nnan,100,18.5\n"),
+        "negative": ("negative.csv", "mass,distance,magnitude\n0.5,-100,18.5\n"),
+        "pairs": ("pairs.csv", "flux_ratio,dx,dy\n2,0,0\n"),
+        "wide": ("wide.csv", "flux_ratio,dx,dy\n1,0.1,0\n"),
+        "config": ("run.yaml", CONFIG.format(stars=stars_file)),
+        "misspelt": ("misspelt.yaml", CONFIG.format(stars=stars_file).replace("n_stars", "n_star")),
+        "impossible": ("impossible.yaml", CONFIG.format(stars=stars_file) + "binary_fraction: 1.2\n"),
+        "none": ("none.yaml", CONFIG.format(stars=stars_file).replace("n_stars: 10", "n_stars: 0")),
+        "unknown_psf": ("unknown.yaml", CONFIG.format(stars=stars_file) + "psf: psf9\n"),
+    }
+    for name, text in files.values():
+        (tmp_path / name).write_text(text)
+    names = {key: str(tmp_path / name) for key, (name, _) in files.items()} | {"stars": str(stars_file)}
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.iterdir())
+    code, out, err = porrima(*(argument.format(**names) for argument in arguments))
+    lines = [line for line in err.splitlines() if line.startswith("error: ")]
+    assert code == 2
+    assert out == ""
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert "Traceback" not in err
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_help_needs_nothing_heavy():
+    code = "import sys, typer, porrima.cli; typer.main.get_command(porrima.cli.app); print(*sys.modules)"
+    modules = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert not {"numpy", "numba", "galsim", "astropy", "xarray", "matplotlib"} & set(modules)
+
+
+@pytest.mark.parametrize("command", ["stars", "measure", "predict", "simulate", "summary", "paper", "bench"])
+def test_every_command_has_help_and_json(porrima, command):
+    code, out, _ = porrima(command, "--help")
+    assert code == 0
+    assert "--json" in out
+
+
+def test_an_interruption_is_not_wrong_input(porrima, monkeypatch, config, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("porrima.simulation.simulate", interrupted)
+    code, _, err = porrima("simulate", config, "-o", tmp_path / "run.zarr")
+    assert code == 1
+    assert "error: interrupted" in err
