@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: test lint paper clean
+.PHONY: test lint validation paper clean
 
 .venv: .venv/installed
 
@@ -18,6 +18,9 @@ lint: .venv/installed
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+validation: .venv/installed
+	$(BIN)/python -m pytest tests/validation --write-validation
 
 paper: .venv/installed
 	$(BIN)/porrima paper --output paper

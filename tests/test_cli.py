@@ -186,6 +186,7 @@ WRONG = [  # arguments, what the one line says
     ([*PREDICT, "--cut", "0"], "cut: must be greater than 0"),
     ([*PREDICT, "--multiplicity", "dk12"], "dk13-kcm16 (did you mean dk13"),
     ([*PREDICT, "--band", "J"], "band must be one of"),
+    ([*GALAXY, "--band", "J"], "band must be one of"),
     (["predict", "--stars", "{stars}", "--psf", "psf1"], "--mag"),
     (["measure", "{pairs}", "--psf", "psf1"], "pairs.csv, row 2, column flux_ratio: must be in [0, 1], got 2"),
     (["measure", "{wide}", "--psf", "psf1"], "use --method images"),

@@ -6,7 +6,7 @@ from porrima.catalogs import read_catalog
 from porrima.multiplicity import MULTIPLICITY, DucheneKraus2013, multiplicity_scale
 
 # Mean multiplicity fraction, i = 16 ... 23, with the solar gap rule and with the lower one, at the pole:
-# FACTS on the Besancon catalogue, computed by others.
+# of the Besancon catalogue, computed by others.
 SOLAR = [0.397, 0.373, 0.341, 0.327, 0.327, 0.339, 0.345]
 LOWER = [0.332, 0.321, 0.295, 0.289, 0.288, 0.298, 0.295]
 

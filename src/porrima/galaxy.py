@@ -294,7 +294,7 @@ class Robin2003:
         Returns
         -------
         stars : Stars
-            With `area` as given.
+            With `area` as given, or None where `n` is given.
 
         Raises
         ------
@@ -331,7 +331,7 @@ class Robin2003:
         return Stars(
             **{name: np.concatenate([getattr(part, name) for part in parts])[:n] for name in _COLUMNS},
             band=band,
-            area=area,
+            area=area if n is None else None,
             source=f"Robin2003, l = {l:g}, b = {b:g} deg, {edges[0]:g} <= {band} < {edges[1]:g}",
         )
 

@@ -82,7 +82,12 @@ def draw_stars(config: PopulationConfig) -> Stars:
         sequence = np.random.SeedSequence(config.seed, spawn_key=(_GALAXY_STREAM,))
         rng = np.random.Generator(np.random.Philox(sequence))
         n = None if where.area else where.n_drawn
-        stars = Robin2003().draw(where.l, where.b, where.area or 1.0, where.band or "i", where.mag, rng, n=n)
+        try:
+            stars = Robin2003().draw(
+                where.l, where.b, where.area or 1.0, where.band or "i", where.mag, rng, n=n
+            )
+        except ValueError as error:
+            raise InputError(str(error), key="stars") from None
     elif where.catalog is not None:
         from porrima.catalogs import read_catalog  # noqa: PLC0415  (astropy's readers, where used)
 

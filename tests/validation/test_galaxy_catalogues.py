@@ -14,7 +14,7 @@ POLE = "catalogues/besancon_l200_b90.dat"  # i of MegaCam (AB), as the file give
 JOHNSON = "catalogues/besancon_l200_b59.csv"  # i (AB) of SDSS from V and V-I
 LOW_DUST = 0.06  # mag/kpc: the second catalogue was made with A_V = 0.006 mag
 
-# b = 90°, main sequence, 16-17 … 22-23 mag: count, median distance in pc, mean mass, mean MF (FACTS.md Sect. 5)
+# b = 90°, main sequence, 16-17 … 22-23 mag: count, median distance in pc, mean mass, mean MF
 POLE_BINS = [
     (167, 726, 0.620, 0.397),
     (282, 1026, 0.569, 0.373),
