@@ -123,6 +123,22 @@ def test_predict_has_the_keys_of_the_contract(porrima, stars_file):
     assert result["sigma_r2"] == pytest.approx(np.hypot(result["bias_r2"], result["sd_r2"]))
 
 
+def test_models_take_options_on_the_command_line(porrima, stars_file):
+    def eta(*options):
+        code, out, err = porrima(
+            "predict", "--stars", stars_file, "--mag", 18, 19, "--psf", "psf0", *options, "--json"
+        )
+        assert code == 0, err
+        return json.loads(out)["eta"]
+
+    named = eta("--multiplicity", "dk13-kcm16")
+    spelt = eta("--multiplicity", "{model: dk13, gap_rule: solar, a_max_factor: 2.5}")
+    assert named == spelt != eta("--multiplicity", "{model: dk13, gap_rule: solar}")
+    assert eta("--photometry", "{model: habets-heintze, branch: primary}") != eta(
+        "--photometry", "habets-heintze"
+    )
+
+
 def test_predict_from_the_galaxy(porrima):
     code, out, _ = porrima("predict", "--l", 180, "--b", 45, "--mag", 18, 19, "--psf", "psf0", "--json")
     assert code == 0
@@ -185,6 +201,8 @@ WRONG = [  # arguments, what the one line says
     ([*PREDICT, "--n-stars", "0"], "--n-stars: must be at least 1, got 0"),
     ([*PREDICT, "--cut", "0"], "cut: must be greater than 0"),
     ([*PREDICT, "--multiplicity", "dk12"], "dk13-kcm16 (did you mean dk13"),
+    ([*PREDICT, "--multiplicity", "{{gap_rule: upper}}"], "multiplicity.gap_rule: must be 'lower' or 'solar', got upper"),
+    ([*PREDICT, "--multiplicity", "{{gap"], "--multiplicity: must be a name or {model: name, option: value}"),
     ([*PREDICT, "--band", "J"], "band must be one of"),
     ([*GALAXY, "--band", "J"], "band must be one of"),
     (["predict", "--stars", "{stars}", "--psf", "psf1"], "--mag"),

@@ -61,6 +61,11 @@ def test_chunk_size_changes_no_number(finished, tmp_path):
         np.testing.assert_array_equal(a[name], b[name])
 
 
+def test_workers_give_the_same_bytes(finished, tmp_path):
+    simulate(small(), tmp_path / "run.zarr", chunk=100, workers=2)
+    assert contents(tmp_path / "run.zarr") == contents(finished)
+
+
 @pytest.mark.parametrize("lost", ["moments/1.0", "moments/2.0"])
 def test_an_interrupted_run_is_resumed_to_the_same_bytes(finished, tmp_path, lost):
     path = tmp_path / "run.zarr"

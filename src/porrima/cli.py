@@ -40,8 +40,15 @@ Format = Annotated[str | None, typer.Option("--format", help="Of the catalogue; 
 Mapping = Annotated[str | None, typer.Option("--map", help="Its columns: mass=M,distance=D,magnitude=I.")]
 Band = Annotated[str | None, typer.Option("--band", help="Of the magnitudes; i, or the catalogue's own.")]
 Mag = Annotated[tuple[float, float], typer.Option("--mag", help="Magnitude range [lo, hi).", metavar="LO HI")]
-MultiplicityName = Annotated[str, typer.Option("--multiplicity", help="dk13 or dk13-kcm16.")]
-PhotometryName = Annotated[str, typer.Option("--photometry", help="main-sequence or habets-heintze.")]
+MultiplicityName = Annotated[
+    str, typer.Option("--multiplicity", help="dk13, dk13-kcm16, or {model: dk13, gap_rule: solar, ...}.")
+]
+PhotometryName = Annotated[
+    str,
+    typer.Option(
+        "--photometry", help="main-sequence, habets-heintze, or {model: habets-heintze, branch: primary}."
+    ),
+]
 Psf = Annotated[str, typer.Option("--psf", help="Name of the PSF.")]
 EstimatorName = Annotated[
     str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")
@@ -172,6 +179,8 @@ def simulate(
     method: Annotated[
         Literal["moments", "images"], typer.Option(help="Moments, or GalSim images.")
     ] = "moments",
+    workers: Annotated[int | None, typer.Option(help="Processes of a local Dask cluster.", min=1)] = None,
+    scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
     chunk: Annotated[int, typer.Option(help="Stacks per chunk.", min=1)] = 10_000,
     seed: Annotated[int | None, typer.Option("--seed", help="Instead of that of the configuration.")] = None,
     example: Annotated[bool, typer.Option("--example", help="Print a configuration.")] = False,
@@ -187,6 +196,8 @@ def simulate(
         raise InputError("is missing", key="CONFIG.yaml")
     if output is None:
         raise InputError("is missing", key="--output")
+    if workers is not None and scheduler is not None:
+        raise InputError("cannot be given together with --scheduler", key="--workers", value=workers)
     run = load(config)
     if seed is not None:
         run = parse(RunConfig, run.model_dump(exclude_unset=True) | {"seed": seed})
@@ -194,7 +205,10 @@ def simulate(
 
     start = time.perf_counter()
     with _Progress(run.n_stacks, "stacks") as progress:
-        done = simulated(run, output, resume=resume, method=method, chunk=chunk, progress=progress.advance)
+        done = simulated(
+            run, output, resume=resume, method=method, chunk=chunk, workers=workers, scheduler=scheduler,
+            progress=progress.advance,
+        )  # fmt: skip
     wall = time.perf_counter() - start
     result = {
         "n_stacks": run.n_stacks,
@@ -311,10 +325,25 @@ def _population_config(**options: Any) -> PopulationConfig:
         if any(len(part) != 2 or not all(part) for part in parts):
             raise InputError("must be column=name,column=name", key="--map", value=columns)
         options["map"] = dict(parts)
+    for name in ("multiplicity", "photometry"):
+        if str(options.get(name, "")).startswith("{"):
+            options[name] = _model_with_options(name, options[name])
     given = {key: value for key, value in options.items() if value is not None}
     stars = {key: value for key, value in given.items() if key in where}
     rest = {key: value for key, value in given.items() if key not in where}
     return parse(PopulationConfig, {"stars": stars} | rest)
+
+
+def _model_with_options(name: str, text: str) -> Any:
+    """A model with options as a configuration has it, such as {model: dk13, gap_rule: solar}."""
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(
+            "must be a name or {model: name, option: value}", key=f"--{name}", value=text
+        ) from None
 
 
 def _predicted(

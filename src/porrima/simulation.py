@@ -6,10 +6,13 @@ import hashlib
 import json
 import os
 import shutil
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Literal
 
+import numba
 import numpy as np
 import xarray as xr
 import zarr
@@ -26,7 +29,7 @@ from porrima.stars import Stars
 from porrima.systems import BRIGHT_MASS, Population
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -132,6 +135,8 @@ def simulate(
     resume: bool = False,
     method: Method = "moments",
     chunk: int = CHUNK,
+    workers: int | None = None,
+    scheduler: str | None = None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> int:
     """Number of stacks computed and written to a store; those already there are left as they are.
@@ -148,6 +153,10 @@ def simulate(
         Shapes from kernel moments through the response, or from images drawn and measured with GalSim.
     chunk : int
         Stacks per chunk (count); a resumed run keeps that of its store.
+    workers : int, optional
+        Processes of a local Dask cluster (count); this process alone where neither is given.
+    scheduler : str, optional
+        Address of a running Dask scheduler.
     progress : callable
         Called with the number of stacks done after each chunk.
 
@@ -164,16 +173,15 @@ def simulate(
     run = _Run(config=config, population=population_of(config, draw_stars(config)), method=method)
     store = _open_or_create(run, path, resume, chunk)
     chunk = store["binary_fraction"].chunks[0]
-    computed = 0
-    for number, first in enumerate(range(0, config.n_stacks, chunk)):
-        last = min(first + chunk, config.n_stacks)
-        if not _is_written(path, number):
-            _write_chunk(store, path, run.chunk(first, last))
-            computed += last - first
-        progress(last - first)
+    ranges = [(first, min(first + chunk, config.n_stacks)) for first in range(0, config.n_stacks, chunk)]
+    missing = [r for number, r in enumerate(ranges) if not _is_written(path, number)]
+    progress(config.n_stacks - sum(last - first for first, last in missing))
+    for result in _computed(run, missing, workers, scheduler):
+        _write_chunk(store, path, result)
+        progress(result.last - result.first)
     for leftover in path.rglob("*.partial"):  # of a process that was killed while it wrote
         leftover.unlink()
-    return computed
+    return sum(last - first for first, last in missing)
 
 
 def open_run(path: Path) -> tuple[xr.Dataset, RunConfig, Population]:
@@ -294,6 +302,45 @@ class _Run:
         for name in _STAR_COLUMNS:
             digest.update(np.ascontiguousarray(getattr(self.population.stars, name)).tobytes())
         return digest.hexdigest()
+
+
+def _computed(
+    run: _Run, ranges: list[tuple[int, int]], workers: int | None, scheduler: str | None
+) -> Iterator[_Chunk]:
+    """Results of ranges of stacks, in any order, from this process or the workers of a Dask cluster."""
+    if workers is None and scheduler is None:
+        yield from (run.chunk(*one) for one in ranges)
+        return
+    try:
+        from dask.distributed import Client, LocalCluster, as_completed  # noqa: PLC0415  (an extra)
+    except ImportError:
+        raise InputError("needs Dask: install porrima[cluster]", key="workers") from None
+    threads = max(1, (os.cpu_count() or 1) // workers) if workers else None
+    with ExitStack() as stack:
+        local = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+        try:
+            where = scheduler or stack.enter_context(LocalCluster(**local))
+            client = stack.enter_context(Client(where, timeout="10s"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot be reached ({error})", key="scheduler", value=scheduler) from None
+        shared = client.scatter(run, broadcast=True)
+        waiting = iter(ranges)
+        ahead = 2 * max(1, len(client.scheduler_info()["workers"]))  # bounds what is held in memory
+        first = [
+            client.submit(_chunk_of, shared, *one, threads, pure=False) for one in islice(waiting, ahead)
+        ]
+        queue = as_completed(first)
+        for done in queue:
+            for one in islice(waiting, 1):
+                queue.add(client.submit(_chunk_of, shared, *one, threads, pure=False))
+            yield done.result()
+
+
+def _chunk_of(run: _Run, first: int, last: int, threads: int | None) -> _Chunk:
+    """Chunk computed on a worker with its share of the cores."""
+    if threads is not None:
+        numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    return run.chunk(first, last)
 
 
 def _open_or_create(run: _Run, path: Path, resume: bool, chunk: int) -> Any:

@@ -1,6 +1,6 @@
 """Figures that others computed for two real catalogues, against `porrima predict` and `porrima stars`.
 
-The figures are those of the project's list of facts (Sect. 1, 2 and 5); the catalogues are outputs
+They were computed apart from Porrima; the catalogues are outputs
 of the Besancon model of 2003 and are not shipped.  Tolerances are those of the figures: the last
 printed digit, or the spread that a change of photometry or colour transformation makes.
 """
