@@ -201,7 +201,7 @@ WRONG = [  # arguments, what the one line says
     ([*PREDICT, "--n-stars", "0"], "--n-stars: must be at least 1, got 0"),
     ([*PREDICT, "--cut", "0"], "cut: must be greater than 0"),
     ([*PREDICT, "--multiplicity", "dk12"], "dk13-kcm16 (did you mean dk13"),
-    ([*PREDICT, "--multiplicity", "{{gap_rule: upper}}"], "multiplicity.gap_rule: must be 'lower' or 'solar', got upper"),
+    ([*PREDICT, "--multiplicity", "{{gap_rule: upper}}"], "gap_rule: must be 'lower' or 'solar', got upper"),
     ([*PREDICT, "--multiplicity", "{{gap"], "--multiplicity: must be a name or {model: name, option: value}"),
     ([*PREDICT, "--band", "J"], "band must be one of"),
     ([*GALAXY, "--band", "J"], "band must be one of"),

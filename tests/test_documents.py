@@ -1,0 +1,220 @@
+"""The documents tell the truth: what they show runs, what they name exists, what exists they name."""
+
+import ast
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+import yaml
+
+import porrima
+from porrima.catalogs import READERS
+from porrima.cli import app, main
+from porrima.config import Multiplicity, Photometry, RunConfig, StarsConfig, parse
+from porrima.multiplicity import MULTIPLICITY
+from porrima.photometry import PHOTOMETRY, MainSequence
+from porrima.psf import PSFS
+from porrima.shapes import ESTIMATORS
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+README, COMMANDS, MODELS = ROOT / "README.md", ROOT / "docs" / "commands.md", ROOT / "docs" / "models.md"
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
+KEY = re.compile(r"\b[A-Z][A-Za-z]*\d{2,4}[a-z]?\b")  # KCM16, Robin2003
+GROUP = typer.main.get_command(app)
+every_command = pytest.mark.parametrize("command", sorted(GROUP.commands))
+
+
+def fenced(path, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
+
+
+def command_lines():
+    for path in DOCUMENTS:
+        for block in fenced(path, "sh"):
+            for line in block.splitlines():
+                if line.startswith("porrima "):
+                    yield pytest.param(line, id=f"{path.name}: {line}")
+
+
+def section(command):
+    """What docs/commands.md says of one command."""
+    text = COMMANDS.read_text(encoding="utf-8")
+    found = re.search(rf"^## `porrima {command}`\n(.*?)(?=^## |\Z)", text, re.M | re.S)
+    return found[1] if found else ""
+
+
+def options(command):
+    return {
+        name for parameter in GROUP.commands[command].params for name in parameter.opts if name[:2] == "--"
+    }
+
+
+def json_of(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["porrima", *map(str, arguments), "--json"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def keys_of(result):
+    """Keys of a JSON object and of the first object in each of its lists."""
+    inner = [value[0] for value in result.values() if isinstance(value, list)]
+    return set(result).union(*map(set, inner))
+
+
+def slug(heading):
+    """Anchor that a heading gets."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+def headings(path):
+    return {slug(heading) for heading in re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.M)}
+
+
+def references_in(docstring):
+    body = re.search(r"^References\n-+\n(.*?)(?=\n\n|\Z)", docstring, re.M | re.S)
+    return set(KEY.findall(body[1])) if body else set()
+
+
+def bibliography():
+    return re.findall(r"^@\w+\{(\w+),", (ROOT / "docs" / "references.bib").read_text(encoding="utf-8"), re.M)
+
+
+def test_the_python_of_the_readme_prints_what_the_readme_says(capsys):
+    (block,), (printed,) = fenced(README, "python"), fenced(README, "text")
+    exec(compile(block, "README.md", "exec"), {})
+    assert capsys.readouterr().out == printed
+
+
+@pytest.mark.parametrize("line", command_lines())
+def test_every_command_line_shown_is_one_that_porrima_takes(line):
+    words = shlex.split(line.split(" > ")[0])[1:]
+    command = GROUP.commands[words[0]]
+    command.make_context(words[0], words[1:])
+
+
+@every_command
+def test_every_option_of_a_command_is_documented_and_no_other(command):
+    shown = set(OPTION.findall(section(command))) - {"--help"}
+    assert shown == options(command) - {"--help"}
+
+
+def test_the_readme_shows_every_command_but_the_benchmark():
+    assert {
+        line.split()[1] for block in fenced(README, "sh") for line in block.splitlines() if "porrima " in line
+    } >= {*GROUP.commands} - {"bench"}
+
+
+def test_every_json_key_is_documented(monkeypatch, capsys, tmp_path):
+    pairs, stars, config, run = (
+        tmp_path / name for name in ("pairs.csv", "stars.ecsv", "run.yaml", "run.zarr")
+    )
+    pairs.write_text("flux_ratio,dx,dy\n0,0,0\n0.5,0.03,0.01\n")
+    config.write_text(
+        "stars: {l: 180, b: 45, mag: [18, 19], n_drawn: 200}\nn_stacks: 8\nn_stars: 5\npsf: psf1\n"
+    )
+    results = {
+        "stars": ["--l", 180, "--b", 60, "--area", 0.2, "--mag", 18, 19, "-o", stars],
+        "predict": ["--stars", stars, "--mag", 18, 19, "--psf", "psf1"],
+        "measure": [pairs, "--psf", "psf1"],
+        "simulate": [config, "-o", run],
+        "summary": [run, "--bins", 1],
+    }
+    for command, arguments in results.items():
+        keys = keys_of(json_of(monkeypatch, capsys, command, *arguments))
+        missing = {key for key in keys if f"`{key}`" not in section(command)}
+        assert not missing, (command, missing)
+
+
+def test_every_key_of_the_configuration_is_documented():
+    table = section("simulate")
+    expected = {f"stars.{name}" for name in StarsConfig.model_fields}
+    expected |= set(RunConfig.model_fields) - {"stars"}
+    expected |= set(Multiplicity.model_fields) | set(Photometry.model_fields)
+    assert not {name for name in expected if f"`{name}`" not in table}
+
+
+def test_configurations_shown_are_valid():
+    shown = [block for path in DOCUMENTS for block in fenced(path, "yaml")]
+    assert shown
+    for block in shown:
+        parse(RunConfig, {"stars": {"l": 0, "b": 90, "mag": [18, 19]}} | yaml.safe_load(block))
+
+
+def test_every_model_format_and_band_has_its_name_in_the_documents():
+    text = COMMANDS.read_text(encoding="utf-8") + MODELS.read_text(encoding="utf-8")
+    bands = {band for band in MainSequence().bands if not band.startswith("roman_")}
+    names = {*MULTIPLICITY, *PHOTOMETRY, *PSFS, *ESTIMATORS, *READERS, *bands}
+    assert not {name for name in names if f"`{name}`" not in text}
+
+
+@pytest.mark.parametrize("model", MULTIPLICITY)
+def test_the_headline_table_is_what_predict_gives(monkeypatch, capsys, model):
+    text = MODELS.read_text(encoding="utf-8")
+    header = re.search(r"^\| i \(AB\) \|(.*)\|$", text, re.M)[1].split("|")
+    row = re.search(rf"^\| `{model}`, Galaxy \|(.*)\|$", text, re.M)[1].split("|")
+    shown = dict(zip((cell.strip() for cell in header), map(float, row), strict=True))
+    line = f"predict --l 180 --b 45 --mag 18 19 --psf psf0 --binary-fraction 0.35 --multiplicity {model}"
+    result = json_of(monkeypatch, capsys, *line.split())
+    assert 1e4 * result["eta"] == pytest.approx(shown["18–19"], rel=0.02)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "src" / "porrima").glob("*.py")), ids=lambda p: p.stem)
+def test_every_reference_of_a_docstring_is_in_the_bibliography(path):
+    kinds = ast.Module | ast.ClassDef | ast.FunctionDef
+    nodes = [
+        node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, kinds)
+    ]
+    cited = set().union(*(references_in(ast.get_docstring(node) or "") for node in nodes))
+    assert cited <= set(bibliography())
+
+
+def test_the_bibliography_has_each_key_once_with_author_title_and_year():
+    keys = bibliography()
+    assert len(keys) == len(set(keys))
+    entries = (ROOT / "docs" / "references.bib").read_text(encoding="utf-8").split("\n@")[1:]
+    for entry in entries:
+        assert all(re.search(rf"^  {name}\s*= \{{", entry, re.M) for name in ("author", "title", "year")), (
+            entry
+        )
+        assert entry.count("{") == entry.count("}"), entry
+    cited = KEY.findall(MODELS.read_text(encoding="utf-8").split("## References")[1])
+    assert cited
+    assert set(cited) <= set(keys)
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+def test_every_link_between_documents_leads_somewhere(path):
+    text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.M | re.S)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith(("https://", "http://", "mailto:")):
+            continue
+        name, _, anchor = link.partition("#")
+        target = (path.parent / name) if name else path
+        assert target.is_file(), link
+        assert not anchor or anchor in headings(target), link
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert {"cff-version", "message", "title", "authors", "version", "license", "references"} <= set(citation)
+    assert citation["cff-version"] == "1.2.0"
+    assert str(citation["version"]) == porrima.__version__
+    assert citation["license"] == "BSD-3-Clause"
+    (paper,) = citation["references"]
+    assert {"type", "title", "authors"} <= set(paper)
+    assert [author["family-names"] for author in paper["authors"]] == ["Kuntzer", "Courbin", "Meylan"]
+    assert "arXiv:1512.01549" in {identifier["value"] for identifier in paper["identifiers"]}
+
+
+def test_the_changelog_has_this_version_and_says_whether_numbers_change():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    release = re.search(rf"^## \[{re.escape(porrima.__version__)}\].*?(?=^## |\Z)", text, re.M | re.S)
+    assert release
+    assert "numbers change:" in release[0]
