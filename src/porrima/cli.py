@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import sys
 import time
 from pathlib import Path
@@ -13,6 +11,7 @@ import typer
 from typer.exceptions import TyperException
 
 from porrima.errors import InputError
+from porrima.terminal import Progress, show
 
 if TYPE_CHECKING:
     from porrima.config import PopulationConfig
@@ -86,7 +85,7 @@ def stars(
         write_stars(selected, output)
     result = {"n": len(selected), "area_deg2": selected.area, "counts": counts}
     table = [[f"{c['mag_lo']:g}-{c['mag_hi']:g}", *list(c.values())[2:]] for c in counts]
-    _show(
+    show(
         result,
         as_json,
         f"{len(selected)} stars, {selected.source}",
@@ -122,7 +121,7 @@ def measure(
     systems = read_systems(table)
     result = _measured(systems, psf_from_name(psf), estimator_from_name(estimator), method)
     header = f"{len(systems)} systems, {psf}, {estimator}, {method}"
-    _show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
+    show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
 
 
 @app.command()
@@ -168,7 +167,7 @@ def predict(
     reply = response(psf_from_name(psf), estimator_from_name(estimator))
     result = _predicted(config, reply, binary_fraction, n_stars)
     header = f"{result['n_catalog_stars']} stars, {psf}, {estimator}, {multiplicity}"
-    _show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
+    show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
 
 
 @app.command()
@@ -204,7 +203,7 @@ def simulate(
     from porrima.simulation import simulate as simulated
 
     start = time.perf_counter()
-    with _Progress(run.n_stacks, "stacks") as progress:
+    with Progress(run.n_stacks, "stacks") as progress:
         done = simulated(
             run, output, resume=resume, method=method, chunk=chunk, workers=workers, scheduler=scheduler,
             progress=progress.advance,
@@ -218,7 +217,7 @@ def simulate(
         "n_stacks_computed": done,
     }
     header = f"{output}: {run.n_stacks} stacks of {run.n_stars} stars"
-    _show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
+    show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
 
 
 @app.command()
@@ -239,7 +238,7 @@ def summary(
     if output is not None:
         write_rows(result, output)
     keys = list(result[0]) if result else []
-    _show({"bins": result}, as_json, str(run), keys, [list(row.values()) for row in result])
+    show({"bins": result}, as_json, str(run), keys, [list(row.values()) for row in result])
 
 
 @app.command()
@@ -255,11 +254,12 @@ def paper(
     from porrima.experiments import errors_and_biases, paper_config
     from porrima.io import make_folder
     from porrima.report import write_report
+    from porrima.summary import rows
 
     config = paper_config(full=full, seed=seed)
     make_folder(output)
     start = time.perf_counter()
-    with _Progress(config.n_stacks, "stacks") as progress:
+    with Progress(config.n_stacks, "stacks") as progress:
         numbers = errors_and_biases(config, output / f"run-{config.n_stacks}-{seed}.zarr", progress.advance)
     report = write_report(numbers, output)
     result = {
@@ -268,7 +268,8 @@ def paper(
         "n_stars": config.n_stars,
         "wall_s": time.perf_counter() - start,
     }
-    _show(result, as_json, f"report: {report}", ["quantity", "value"], [[k, v] for k, v in result.items()])
+    columns = ["PSF", "quantity", "binary fraction", "bias", "prediction", "error", "prediction"]
+    show(result, as_json, f"report: {report}", columns, _numbers_near(rows(numbers.summary), 0.35))
 
 
 @app.command()
@@ -284,7 +285,7 @@ def bench(
     from porrima.bench import measure_speed
 
     result = asdict(measure_speed(n_stars=n_stars, n_stacks=n_stacks, seed=seed))
-    _show(result, as_json, "speed", ["quantity", "value"], [[k, v] for k, v in result.items()])
+    show(result, as_json, "speed", ["quantity", "value"], [[k, v] for k, v in result.items()])
 
 
 def main() -> None:
@@ -379,6 +380,23 @@ def _predicted(
     }
 
 
+def _numbers_near(rows: list[dict[str, Any]], fraction: float) -> list[list[Any]]:
+    """Lines of the bins that begin at a binary fraction, for the terminal; the whole table is in the report."""
+    return [
+        [
+            row["psf"],
+            row["quantity"],
+            f"{row['f_lo']:.2f}-{row['f_hi']:.2f}",
+            f"{row['bias']:+.2e} ± {row['bias_se']:.0e}",
+            f"{row['prediction_bias']:+.2e}",
+            f"{row['sigma']:.3e} ± {row['sigma_se']:.0e}",
+            f"{row['prediction_sigma']:.3e}",
+        ]
+        for row in rows
+        if row["f_lo"] <= fraction < row["f_hi"]
+    ]
+
+
 def _measured(systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, float]:
     """Shape of a stack and its change, as `measure` shows it."""
     import numpy as np
@@ -417,60 +435,3 @@ def _measured(systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, 
             "dr2_rel": stack["r2"] / single["r2"] - 1,
         }
     )
-
-
-class _Progress:
-    """A bar on standard error, with the rate and the time left."""
-
-    def __init__(self, total: int, unit: str) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self._bar = Progress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn(unit),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
-        self._task = self._bar.add_task(unit, total=total)
-
-    def advance(self, n: int) -> None:
-        self._bar.update(self._task, advance=n)
-
-    def __enter__(self) -> _Progress:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-
-def _show(
-    result: dict[str, Any], as_json: bool, header: str, columns: list[str], table: list[list[Any]]
-) -> None:
-    """Print a result: one JSON object, or a header and a table."""
-    if as_json:
-        print(json.dumps(_plain(result), allow_nan=False))
-        return
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    grid = Table(*columns, box=box.SIMPLE_HEAD)
-    for row in table:
-        grid.add_row(*(f"{value:.6g}" if isinstance(value, float) else str(value) for value in row))
-    console = Console(width=None if sys.stdout.isatty() else 200)
-    console.print(header, markup=False, highlight=False)
-    console.print(grid)
-
-
-def _plain(value: Any) -> Any:
-    """A result as JSON has it: no numpy types, null for what is not a finite number."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value
