@@ -190,7 +190,7 @@ WRONG = [  # arguments, what the one line says
     (["stars", "--catalog", "{negative}"], "negative.csv, row 2, column distance"),
     (["stars", "--catalog", "{stars}", "--mag", "1", "2"], "with magnitude in [1.0, 2.0)"),
     (["stars", "--catalog", "absent.csv"], "absent.csv: must be a readable file"),
-    (["stars", "--mag", "18", "19"], "must have either l and b, or catalog"),
+    (["stars", "--mag", "18", "19"], "must have either a direction (l and b) or a catalogue"),
     (["stars", "--l", "180", "--b", "95"], "b: must be less than or equal to 90, got 95"),
     ([*GALAXY, "--mag", "18"], "--mag"),
     ([*GALAXY, "--area", "0.01", "--mag", "18", "19", "-o", "nowhere/s.ecsv"], "nowhere/s.ecsv"),

@@ -51,11 +51,14 @@ def test_models_by_name_and_with_options():
         ({"psf": []}, "psf: "),
         ({"psf": ["psf0", "psf0"]}, "psf: must name each PSF once, got psf0, psf0"),
         ({"stars": {"l": 180, "b": 45}}, "stars.mag: is missing"),
-        ({"stars": {"mag": [18, 19]}}, "stars: must have either l and b, or catalog"),
-        ({"stars": {"l": 180, "mag": [18, 19]}}, "stars: must have either l and b, or catalog"),
+        ({"stars": {"mag": [18, 19]}}, "stars: must have either a direction (l and b) or a catalogue"),
+        (
+            {"stars": {"l": 180, "mag": [18, 19]}},
+            "stars: must have either a direction (l and b) or a catalogue",
+        ),
         (
             {"stars": {"l": 1, "b": 1, "catalog": "x", "mag": [18, 19]}},
-            "stars: must have either l and b, or catalog",
+            "stars: must have either a direction (l and b) or a catalogue",
         ),
         (
             {"stars": {"l": 180, "b": 95, "mag": [18, 19]}},

@@ -92,7 +92,7 @@ def test_the_python_of_the_readme_prints_what_the_readme_says(capsys):
     assert capsys.readouterr().out == printed
 
 
-@pytest.mark.parametrize("line", command_lines())
+@pytest.mark.parametrize("line", list(command_lines()))
 def test_every_command_line_shown_is_one_that_porrima_takes(line):
     words = shlex.split(line.split(" > ")[0])[1:]
     command = GROUP.commands[words[0]]

@@ -23,6 +23,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # a unit in brackets is no markup
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -119,7 +120,7 @@ def measure(
     from porrima.shapes import estimator_from_name
 
     systems = read_systems(table)
-    result = _measured(systems, psf_from_name(psf), estimator_from_name(estimator), method)
+    result = _measured(table, systems, psf_from_name(psf), estimator_from_name(estimator), method)
     header = f"{len(systems)} systems, {psf}, {estimator}, {method}"
     show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
 
@@ -237,8 +238,7 @@ def summary(
     result = rows(summarise(*open_run(run), bins=bins))
     if output is not None:
         write_rows(result, output)
-    keys = list(result[0]) if result else []
-    show({"bins": result}, as_json, str(run), keys, [list(row.values()) for row in result])
+    show({"bins": result}, as_json, str(run), _NUMBER_COLUMNS, _numbers(result))
 
 
 @app.command()
@@ -268,8 +268,8 @@ def paper(
         "n_stars": config.n_stars,
         "wall_s": time.perf_counter() - start,
     }
-    columns = ["PSF", "quantity", "binary fraction", "bias", "prediction", "error", "prediction"]
-    show(result, as_json, f"report: {report}", columns, _numbers_near(rows(numbers.summary), 0.35))
+    near = [row for row in rows(numbers.summary) if row["f_lo"] <= 0.35 < row["f_hi"]]
+    show(result, as_json, f"report: {report}", _NUMBER_COLUMNS, _numbers(near))
 
 
 @app.command()
@@ -380,24 +380,25 @@ def _predicted(
     }
 
 
-def _numbers_near(rows: list[dict[str, Any]], fraction: float) -> list[list[Any]]:
-    """Lines of the bins that begin at a binary fraction, for the terminal; the whole table is in the report."""
+_NUMBER_COLUMNS = [
+    "PSF", "quantity", "binary fraction", "stacks", "bias", "predicted", "sigma", "predicted", "sd", "predicted",
+]  # fmt: skip
+
+
+def _numbers(rows: list[dict[str, Any]]) -> list[list[Any]]:
+    """Lines of a summary for the terminal: each number with its standard error, beside the prediction."""
     return [
-        [
-            row["psf"],
-            row["quantity"],
-            f"{row['f_lo']:.2f}-{row['f_hi']:.2f}",
-            f"{row['bias']:+.2e} ± {row['bias_se']:.0e}",
-            f"{row['prediction_bias']:+.2e}",
-            f"{row['sigma']:.3e} ± {row['sigma_se']:.0e}",
-            f"{row['prediction_sigma']:.3e}",
+        [row["psf"], row["quantity"], f"{row['f_lo']:.2f}-{row['f_hi']:.2f}", row["n_stacks"]]
+        + [
+            text
+            for name in ("bias", "sigma", "sd")
+            for text in (f"{row[name]:.2e} ± {row[f'{name}_se']:.0e}", f"{row[f'prediction_{name}']:.2e}")
         ]
         for row in rows
-        if row["f_lo"] <= fraction < row["f_hi"]
     ]
 
 
-def _measured(systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, float]:
+def _measured(table: Path, systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, float]:
     """Shape of a stack and its change, as `measure` shows it."""
     import numpy as np
 
@@ -420,7 +421,7 @@ def _measured(systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, 
                 "has pairs too wide for this PSF's kernel moments: use --method images", key="TABLE"
             )
         if flag:
-            raise InputError(f"gives a stack that cannot be measured ({flag.name})", key="TABLE")
+            raise InputError(f"gives a stack that cannot be measured ({flag.name})", source=table)
         return found
 
     stack, single = (

@@ -55,7 +55,7 @@ class StarsConfig(_Strict):
     def _one_source(self) -> StarsConfig:
         direction = self.l is not None and self.b is not None
         if direction == (self.catalog is not None) or (self.l is None) != (self.b is None):
-            raise ValueError("must have either l and b, or catalog")
+            raise ValueError("must have either a direction (l and b) or a catalogue")
         if not self.mag[0] < self.mag[1]:
             raise ValueError(f"mag must be [lo, hi) with lo < hi, got {list(self.mag)}")
         return self

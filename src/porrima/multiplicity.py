@@ -93,7 +93,8 @@ class DucheneKraus2013:
     scatter_scale : float
         Factor on the scatter of log period, dimensionless.  The code of 2017 amounts to 1/(ln 10)^2.
     projection : {"isotropic", "inclination-uniform"}
-        Isotropic orbits, or KCM16's literal text (inclination uniform in angle), which raises eta by 2-6 %.
+        Isotropic orbits, or KCM16's literal text (inclination uniform in angle), which raises eta by 2-5 %,
+        and by up to 12 % where orbits are truncated.
     mass_ratio_min : float
         Least mass ratio, in (0, 1).
 

@@ -50,7 +50,8 @@ pre {{ background: #f4f4f4; padding: 0.8rem; white-space: pre-wrap; overflow-wra
 <figcaption>Error (left) and bias (right) of the size and the two ellipticity components of a stack of {n_stars} stars,
 {mag} mag in {band}, against the binary fraction of the population, after Kuntzer, Courbin &amp; Meylan (2016), Fig. 4.
 Symbols: {n_stacks} simulated stacks with standard errors; the PSFs are set apart a little. Solid: closed form for
-{n_stars} stars. Dashed: closed form for infinitely many stars. Dotted: requirement of {requirement}.</figcaption>
+{n_stars} stars. Dashed: closed form for infinitely many stars. The PSFs share
+the stacks, and so their scatter. Dotted: requirement of {requirement}.</figcaption>
 </figure>
 <h2>Simulation against prediction</h2>
 <p>{agreement}</p>
@@ -128,10 +129,17 @@ def _answer(numbers: ErrorsAndBiases) -> str:
     limit = numbers.limit.isel(psf=0).sel(quantity="r2").interp(binary_fraction=0.35)
     share = float(limit["bias"]) / KCM16.sigma_r2
     return (
-        f"With 35 % binaries the mean of x is {numbers.mean_x:.3g} arcsec², which makes the stacked PSF "
-        f"{float(limit['bias']):.2e} larger: {share:.0%} of the size requirement of {KCM16.sigma_r2:g}. "
-        "More stars in the stack lower the scatter, not this bias."
+        f"With 35 % binaries the mean of x = f r²/(1 + f)² over the stars is {_power(numbers.mean_x)} arcsec², and the "
+        f"PSF of a stack comes out larger by {_power(float(limit['bias']))} ({numbers.config.estimator} moments): "
+        f"{share:.0%} of the size requirement of {_power(KCM16.sigma_r2)}. More stars in the stack lower the scatter, "
+        "not this bias."
     )
+
+
+def _power(value: float) -> str:
+    """Number as a reader of print expects it, with three figures."""
+    mantissa, exponent = f"{value:.2e}".split("e")
+    return f"{mantissa} × 10<sup>{int(exponent)}</sup>".replace("-", "−")
 
 
 def _agreement(summary: xr.Dataset) -> str:
@@ -145,16 +153,22 @@ def _agreement(summary: xr.Dataset) -> str:
 
 
 def _table(summary: xr.Dataset) -> str:
-    names = ("bias", "bias_se", "prediction_bias", "sigma", "sigma_se", "prediction_sigma")
-    head = "".join(
-        f"<th scope='col'>{n}</th>" for n in ("PSF", "quantity", "binary fraction", "stacks", *names)
-    )
+    names = ("bias", "sigma", "sd")
+    heads = ("PSF", "quantity", "binary fraction", "stacks", *(h for n in names for h in (n, "predicted")))
+    head = "".join(f"<th scope='col'>{name}</th>" for name in heads)
     body = "".join(
         f"<tr><td>{escape(row['psf'])}</td><td>{row['quantity']}</td>"
         f"<td>{row['f_lo']:.2f}–{row['f_hi']:.2f}</td><td>{row['n_stacks']}</td>"
-        + "".join(f"<td>{row[name]:.3e}</td>" for name in names)
+        + "".join(
+            f"<td>{_with_error(row[name], row[f'{name}_se'])}</td><td>{row[f'prediction_{name}'] * 1e3:.4f}</td>"
+            for name in names
+        )
         + "</tr>\n"
         for row in rows(summary)
     )
-    caption = "<caption>Per PSF, quantity and bin</caption>"
+    caption = "<caption>Per PSF, quantity and bin, in units of 10<sup>−3</sup></caption>"
     return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value * 1e3:.4f} ± {error * 1e3:.4f}"

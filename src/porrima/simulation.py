@@ -96,7 +96,7 @@ def draw_stars(config: PopulationConfig) -> Stars:
 
         stars = read_catalog(where.catalog, format=where.format, columns=where.map, band=where.band).stars
     else:
-        raise InputError("must have either l and b, or catalog", key="stars")
+        raise InputError("must have either a direction (l and b) or a catalogue", key="stars")
     selected = stars.select(magnitude=config.stars.mag, mass_max=BRIGHT_MASS)
     if len(selected) == 0:
         low, high = config.stars.mag
@@ -170,6 +170,7 @@ def simulate(
     InputError
         If the path cannot be written, exists, or holds another configuration; or the configuration is wrong.
     """
+    _check_output(path, resume)
     run = _Run(config=config, population=population_of(config, draw_stars(config)), method=method)
     store = _open_or_create(run, path, resume, chunk)
     chunk = store["binary_fraction"].chunks[0]
@@ -205,6 +206,8 @@ def open_run(path: Path) -> tuple[xr.Dataset, RunConfig, Population]:
     try:
         dataset = xr.open_zarr(path, chunks=None)
         config = parse(RunConfig, json.loads(dataset.attrs["config"]), source=path)
+        columns = {name: dataset[f"star_{name}"].to_numpy() for name in _STAR_COLUMNS}
+        stars = Stars.from_columns(**columns, band=dataset.attrs["band"], source=dataset.attrs["stars"])
     except (OSError, KeyError, ValueError):
         raise InputError("is not a run of porrima simulate", source=path) from None
     chunk = dataset["binary_fraction"].encoding["chunks"][0]
@@ -213,9 +216,6 @@ def open_run(path: Path) -> tuple[xr.Dataset, RunConfig, Population]:
         raise InputError(
             f"is not complete ({len(missing)} chunks missing): run again with --resume", source=path
         )
-    stars = Stars.from_columns(
-        **{name: dataset[f"star_{name}"].to_numpy() for name in _STAR_COLUMNS}, band=dataset.attrs["band"]
-    )
     return dataset, config, population_of(config, stars)
 
 
@@ -343,12 +343,18 @@ def _chunk_of(run: _Run, first: int, last: int, threads: int | None) -> _Chunk:
     return run.chunk(first, last)
 
 
+def _check_output(path: Path, resume: bool) -> None:
+    """Refuse a path that cannot be used, before any work is done."""
+    if path.exists() and not resume:
+        raise InputError(
+            "exists already; go on with it by --resume, or choose another", key="output", value=path
+        )
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise InputError("must lie in a folder that can be written", key="output", value=path)
+
+
 def _open_or_create(run: _Run, path: Path, resume: bool, chunk: int) -> Any:
     if path.exists():
-        if not resume:
-            raise InputError(
-                "exists already; go on with it by --resume, or choose another", key="output", value=path
-            )
         try:
             store = zarr.open_group(path, mode="r+")
             identity = store.attrs["identity"]
@@ -359,9 +365,6 @@ def _open_or_create(run: _Run, path: Path, resume: bool, chunk: int) -> Any:
                 "holds a run of another configuration, stars or version", key="output", value=path
             )
         return store
-    parent = path.parent if str(path.parent) else path
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError("must lie in a folder that can be written", key="output", value=path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         _create(run, unfinished, min(chunk, run.config.n_stacks))

@@ -9,7 +9,8 @@ from typing import Any
 
 from rich import box, progress
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 __all__ = ["Progress", "show"]
 
@@ -28,11 +29,11 @@ class Progress:
         self._task = self._bar.add_task(unit, total=total)
 
     def advance(self, n: int) -> None:
-        """Count n more as done."""
+        """Count n more as done; the bar is there from the first call on, so that an error comes before it."""
+        self._bar.start()
         self._bar.update(self._task, advance=n)
 
     def __enter__(self) -> Progress:
-        self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -65,9 +66,11 @@ def show(
     if as_json:
         print(json.dumps(_plain(result), allow_nan=False))
         return
-    grid = Table(*columns, box=box.SIMPLE_HEAD)
+    grid = Table(
+        *(Column(Text(column)) for column in columns), box=box.SIMPLE_HEAD
+    )  # a unit in brackets is no markup
     for row in table:
-        grid.add_row(*(f"{value:.6g}" if isinstance(value, float) else str(value) for value in row))
+        grid.add_row(*(Text(f"{value:.6g}" if isinstance(value, float) else str(value)) for value in row))
     console = Console(width=None if sys.stdout.isatty() else 200)
     console.print(header, markup=False, highlight=False)
     console.print(grid)

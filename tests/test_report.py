@@ -1,0 +1,121 @@
+"""Experiment, figure and report of the paper's six panels, on a small run."""
+
+import re
+from html.parser import HTMLParser
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from porrima.config import RunConfig, StarsConfig
+from porrima.experiments import errors_and_biases, paper_config
+from porrima.figures import errors_and_biases as drawn
+from porrima.instruments import EUCLID_VIS, KCM16
+from porrima.report import write_report
+
+
+@pytest.fixture(scope="module")
+def numbers(tmp_path_factory):
+    config = RunConfig(stars=StarsConfig(l=180, b=45, mag=(18, 19), n_drawn=500), n_stacks=20_000)
+    return errors_and_biases(config, tmp_path_factory.mktemp("paper") / "run.zarr")
+
+
+def test_the_setting_is_that_of_the_paper():
+    config = paper_config()
+    assert (config.stars.l, config.stars.b, config.stars.mag) == (180, 45, (18, 19))
+    assert (config.n_stars, config.psf, config.estimator) == (40, ("psf0", "psf1", "psf2"), "adaptive")
+    assert config.n_stacks >= 100_000
+    assert paper_config(full=True).n_stacks > config.n_stacks
+
+
+def test_requirements_and_instruments_name_their_source():
+    assert (KCM16.sigma_e, KCM16.sigma_r2) == (2e-4, 1e-3)
+    assert "Paulin-Henriksson" in KCM16.source
+    assert EUCLID_VIS.pixel == 0.1
+    assert EUCLID_VIS.source
+
+
+def test_an_experiment_uses_its_stacks_again(numbers, tmp_path):
+    seen = []
+    errors_and_biases(numbers.config, tmp_path / "run.zarr", seen.append)
+    again = []
+    errors_and_biases(numbers.config, tmp_path / "run.zarr", again.append)
+    assert sum(seen) == sum(again) == 20_000
+    assert again == [20_000]
+
+
+def test_each_panel_shows_its_symbols_and_lines(numbers):
+    figure = drawn(numbers.summary, numbers.curves, numbers.limit, KCM16)
+    axes = figure.axes
+    assert len(axes) == 6
+    for axis, (quantity, statistic) in zip(
+        axes, [(q, s) for q in ("r2", "e1", "e2") for s in ("sigma", "bias")], strict=True
+    ):
+        assert axis.get_ylabel()
+        for p, bars in enumerate(axis.containers):
+            here = {"psf": numbers.summary["psf"].to_numpy()[p], "quantity": quantity}
+            np.testing.assert_allclose(
+                np.asarray(bars.lines[0].get_ydata(), dtype=float), numbers.summary[statistic].sel(here)
+            )
+        lines = [np.asarray(line.get_ydata(), dtype=float) for line in axis.lines]
+        assert any(
+            np.array_equal(y, numbers.curves[statistic].sel(psf="psf1", quantity=quantity)) for y in lines
+        )
+        if statistic == "sigma":
+            assert any(
+                np.array_equal(y, numbers.limit["sigma"].sel(psf="psf1", quantity=quantity)) for y in lines
+            )
+    assert {axis.get_xlabel() for axis in axes[-2:]} == {"binary fraction of the population"}
+
+
+class _Page(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.open, self.links = [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.links += [v for k, v in attributes if k in ("src", "href") and not v.startswith("#")]
+        if tag not in ("meta", "br", "link", "img", "path", "use", "rect"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.links += [v for k, v in attributes if k in ("src", "href") and not v.startswith("#")]
+
+    def handle_endtag(self, tag):
+        if self.open and self.open[-1] == tag:
+            self.open.pop()
+
+
+def test_the_page_needs_no_network_and_quotes_the_saved_numbers(numbers, tmp_path):
+    path = write_report(numbers, tmp_path)
+    text = path.read_text(encoding="utf-8")
+    page = _Page()
+    page.feed(text)
+    assert page.open == []
+    assert not [link for link in page.links if link.startswith(("http", "//"))]
+    first = numbers.summary["bias"].sel(psf="psf0", quantity="r2")[0].item()
+    assert f"{first * 1e3:.4f} ± " in text
+    assert '"seed": 1' in text.replace("&quot;", '"')
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "errors_and_biases.ecsv",
+        "errors_and_biases.pdf",
+        "errors_and_biases.png",
+        "errors_and_biases.svg",
+        "index.html",
+    ]
+
+
+def test_the_same_numbers_give_the_same_files(numbers, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write_report(numbers, tmp_path / name)
+    for name in ("errors_and_biases.ecsv", "errors_and_biases.pdf"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_the_table_and_the_vector_figure_can_be_read(numbers, tmp_path):
+    write_report(numbers, tmp_path)
+    table = Table.read(tmp_path / "errors_and_biases.ecsv")
+    assert len(table) == 3 * 3 * 20
+    assert re.search("svg", ElementTree.parse(tmp_path / "errors_and_biases.svg").getroot().tag)
