@@ -189,6 +189,37 @@ def test_bias_and_scatter_against_simulated_stacks(population, estimator, n_star
             assert_within_sigma(change.std(), found.sd[q, 0], error)
 
 
+@pytest.mark.parametrize("fraction", [0.35, 0.9])
+def test_stacks_weighted_by_flux_against_simulated_ones(stars, fraction):
+    models = {"multiplicity": DucheneKraus2013(), "photometry": PHOTOMETRY["main-sequence"]}
+    population = Population.of(stars, stack_weight="flux", **models)
+    moments = population_moments(population, integrate(population), np.array([fraction]))
+    assert 0.8 < moments.effective_share[0] < 1
+    n_stars, n_stacks = 200, 20_000
+    stacks = draw_stacks(
+        population, n_stars=n_stars, binary_fraction=fraction, seed=4, first=0, last=n_stacks
+    )
+    found = predict(moments, plain(), n_stars)
+    change = stacks.moments.values[:, 0] + stacks.moments.values[:, 2]
+    assert_within_sigma(change.mean(), found.bias[2, 0] * found.r2_0, change.std() / np.sqrt(n_stacks))
+    error = np.sqrt((((change - change.mean()) ** 4).mean() - change.var() ** 2) / n_stacks) / (
+        2 * change.std()
+    )
+    assert_within_sigma(change.std(), found.sd[2, 0] * found.r2_0, error)
+
+
+def test_equal_magnitudes_make_the_weights_equal():
+    star = Stars.from_columns(mass=[0.3, 0.8], distance=[300, 700], magnitude=[18.5, 18.5])
+    models = {"multiplicity": DucheneKraus2013(), "photometry": PHOTOMETRY["main-sequence"]}
+    one, other = (
+        population_moments(p, integrate(p), np.array([0.4]))
+        for p in (Population.of(star, stack_weight=w, **models) for w in ("equal", "flux"))
+    )
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-12)
+    np.testing.assert_allclose(other.shift, 0, atol=1e-20)
+    assert other.effective_share[0] == pytest.approx(1)
+
+
 def test_stars_integrated_in_parts_are_the_same(population, monkeypatch):
     whole = integrate(population)
     monkeypatch.setattr(prediction, "_CHUNK", 7)

@@ -5,6 +5,7 @@ import pytest
 from porrima.moments import INDICES
 from porrima.multiplicity import DucheneKraus2013
 from porrima.photometry import PHOTOMETRY, HabetsHeintze1981, flux_ratio
+from porrima.prediction import integrate
 from porrima.stack import draw_stacks, draw_systems
 from porrima.systems import Population
 from statistics_helpers import assert_within_sigma
@@ -128,6 +129,25 @@ def test_the_engine_draws_what_plain_numpy_draws(stars, options, photometry):
     variance, per_star = drawn.var(axis=0) * n_stars, expected.var(axis=0)
     error = [np.sqrt((((v - v.mean(0)) ** 4).mean(0) - v.var(0) ** 2) / len(v)) for v in (drawn, expected)]
     assert_within_sigma(variance, per_star, np.hypot(error[0] * n_stars, error[1]))
+
+
+@pytest.mark.parametrize("fraction", [0.3, 0.9])
+def test_stars_weighted_by_flux_are_what_plain_numpy_draws(stars, fraction):
+    """Whole stacks with each star's own flux: sum of w m over sum of w, singles included."""
+    models = {"multiplicity": DucheneKraus2013(), "photometry": PHOTOMETRY["main-sequence"]}
+    population = Population.of(stars, stack_weight="flux", **models)
+    run = {"n_stars": 30, "binary_fraction": fraction, "seed": 9}
+    stacks = draw_stacks(population, first=0, last=20_000, **run)
+    systems = draw_systems(population, stack=3, **run)
+    np.testing.assert_allclose(
+        systems.kernel_moments().values[0], stacks.moments.values[3], rtol=1e-12, atol=1e-30
+    )
+    # the weights of a stack are the fluxes of stars as the kept sample holds them
+    weights = np.concatenate([draw_systems(population, stack=k, **run).weight for k in range(400)])
+    p = np.minimum(1, population.scale(np.array([fraction]))[0] * population.law.multiplicity_fraction)
+    kept = 1 - p * (1 - integrate(population).unresolved)
+    expected = np.average(population.weight, weights=kept)
+    assert_within_sigma(weights.mean(), expected, weights.std() / np.sqrt(weights.size))
 
 
 @pytest.mark.parametrize(

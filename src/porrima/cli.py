@@ -145,6 +145,7 @@ def predict(
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
     cut: Annotated[float, typer.Option(help="Separation from which a pair is resolved [arcsec].")] = 0.05,
+    stack_weight: Annotated[str, typer.Option(help="equal, or flux.")] = "equal",
     seed: Seed = 1,
     as_json: Json = False,
 ) -> None:
@@ -163,7 +164,7 @@ def predict(
         raise InputError("must be at least 1", key="--n-stars", value=n_stars)
     config = _population_config(
         l=l, b=b, catalog=catalog, format=format, map=map, band=band, mag=mag, seed=seed,
-        multiplicity=multiplicity, photometry=photometry, cut=cut,
+        multiplicity=multiplicity, photometry=photometry, cut=cut, stack_weight=stack_weight,
     )  # fmt: skip
     reply = response(psf_from_name(psf), estimator_from_name(estimator))
     result = _predicted(config, reply, binary_fraction, n_stars)
@@ -372,6 +373,7 @@ def _predicted(
         "eta": prediction.eta[0],
         **errors,
         "n_stars": n_stars,
+        "effective_n_stars": None if n_stars is None else n_stars * moments.effective_share[0],
         "binary_fraction": binary_fraction,
         "population_binary_fraction": moments.binary_fraction[0],
         "unresolved_fraction": moments.unresolved_fraction[0],

@@ -22,6 +22,7 @@ stars: {l: 180, b: 45, band: i, mag: [18, 19]}     # or {catalog: FILE, format: 
 multiplicity: dk13                                  # or {model: dk13, gap_rule: solar, a_max_factor: 2.5, ...}
 photometry: main-sequence                           # or habets-heintze, {model: habets-heintze, branch: primary}
 cut: 0.05                                           # arcsec
+stack_weight: equal                                 # or flux
 psf: [psf0, psf1, psf2]
 estimator: adaptive                                 # or plain, gaussian:0.75
 n_stars: 40
@@ -129,6 +130,7 @@ class PopulationConfig(_Strict):
     multiplicity: Multiplicity = Multiplicity()
     photometry: Photometry = Photometry()
     cut: float = Field(default=0.05, gt=0, allow_inf_nan=False)
+    stack_weight: Literal["equal", "flux"] = "equal"
     seed: int = Field(default=1, ge=0, lt=2**64)
 
     @field_validator("multiplicity", "photometry", mode="before")

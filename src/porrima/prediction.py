@@ -70,13 +70,17 @@ class PopulationMoments:
     removed_fraction : (k,) float array
         Share of resolved pairs among all pairs, in [0, 1].
     mean_x : (k,) float array
-        :math:`\langle x \rangle = \langle f r^2/(1+f)^2 \rangle`, in arcsec².
+        :math:`\langle x \rangle = \langle f r^2/(1+f)^2 \rangle` with the weights of the stack, in arcsec².
     mean_x2 : (k,) float array
-        :math:`\langle x^2 \rangle`, in arcsec⁴.
+        :math:`\langle x^2 \rangle`, likewise, in arcsec⁴.
+    effective_share : (k,) float array
+        Effective number of stars over the number in the stack, (0, 1]; 1 for equal weights.
     mean : (k, n_moment) float array
-        Mean kernel moments in the order of `moments.INDICES`, in arcsec^(a+b).
+        Mean kernel moments of an endless stack in the order of `moments.INDICES`, in arcsec^(a+b).
+    shift : (k, n_moment) float array
+        N times the difference from it of the mean over stacks of N stars; 0 for equal weights.
     covariance : (k, n_moment, n_moment) float array
-        Their covariance between stars.
+        N times the covariance of the moments of stacks of N stars.
     """
 
     binary_fraction: FloatArray
@@ -84,7 +88,9 @@ class PopulationMoments:
     removed_fraction: FloatArray
     mean_x: FloatArray
     mean_x2: FloatArray
+    effective_share: FloatArray
     mean: FloatArray
+    shift: FloatArray
     covariance: FloatArray
 
 
@@ -253,27 +259,43 @@ def population_moments(
     Notes
     -----
     With :math:`p_i = \min(1, s\, MF_i)`,
-    :math:`\langle x^k \rangle = \sum_i p_i E[x^k; r < r_{cut}]_i / \sum_i (1 - p_i P_{res,i})`.
+    :math:`\langle x^k \rangle = \sum_i p_i E[x^k; r < r_{cut}]_i / \sum_i (1 - p_i P_{res,i})`.  With weights w a
+    stack's moments are the ratio :math:`\sum w k / \sum w`: to first order in 1/N their mean is
+    :math:`m - [\langle w^2 k\rangle - m \langle w^2\rangle] / (N \langle w\rangle^2)`, their covariance
+    :math:`\langle w^2 (k - m)(k' - m')\rangle / (N \langle w\rangle^2)`, and the effective number is
+    :math:`N \langle w\rangle^2/\langle w^2\rangle`.  Exact for equal weights.
     """
-    fraction = population.law.multiplicity_fraction
+    fraction, w = population.law.multiplicity_fraction, population.weight
     scale = population.scale(binary_fraction)
     order = np.argsort(fraction, kind="stable")
+    resolved = 1 - integrals.unresolved
     columns = np.column_stack(
-        [np.ones(fraction.size), integrals.unresolved, integrals.mean, integrals.product]
-    )[order]
+        [
+            np.ones(fraction.size), resolved, w * resolved, w**2 * resolved,
+            w[:, None] * integrals.mean, w * integrals.product[:, 0],
+            w[:, None] ** 2 * integrals.mean, w[:, None] ** 2 * integrals.product,
+        ]
+    )[order]  # fmt: skip
     sums = _weighted_sums(fraction[order], columns, scale)
-    pairs, unresolved = sums[:, 0], sums[:, 1]
-    kept = fraction.size - (pairs - unresolved)
-    mean_of_order = dict(zip(_EVEN, (sums[:, 2 : 2 + len(_EVEN)] / kept[:, None]).T, strict=True))
-    product_of_orders = dict(zip(_PRODUCTS, (sums[:, 2 + len(_EVEN) :] / kept[:, None]).T, strict=True))
-    mean, covariance = _isotropic(mean_of_order, product_of_orders)
+    pairs, resolved_pairs = sums[:, 0], sums[:, 1]
+    kept = fraction.size - resolved_pairs
+    mean_w, mean_w2 = (w.sum() - sums[:, 2]) / kept, ((w**2).sum() - sums[:, 3]) / kept
+    first, x2, second, product = np.split(sums[:, 4:], np.cumsum([4, 1, 4]), axis=1)
+    mean = _isotropic_means(first / (kept * mean_w)[:, None])
+    weighted = _isotropic_means(second / (kept * mean_w**2)[:, None])
+    spread = (mean_w2 / mean_w**2)[:, None]
+    covariance = _isotropic_products(product / (kept * mean_w**2)[:, None])
+    covariance -= mean[:, :, None] * weighted[:, None, :] + weighted[:, :, None] * mean[:, None, :]
+    covariance += spread[:, :, None] * mean[:, :, None] * mean[:, None, :]
     return PopulationMoments(
         binary_fraction=pairs / fraction.size,
-        unresolved_fraction=unresolved / kept,
-        removed_fraction=np.divide(pairs - unresolved, pairs, out=np.zeros_like(pairs), where=pairs > 0),
-        mean_x=mean_of_order[2],
-        mean_x2=product_of_orders[2, 2],
+        unresolved_fraction=(pairs - resolved_pairs) / kept,
+        removed_fraction=np.divide(resolved_pairs, pairs, out=np.zeros_like(pairs), where=pairs > 0),
+        mean_x=first[:, 0] / (kept * mean_w),
+        mean_x2=x2[:, 0] / (kept * mean_w),
+        effective_share=1 / spread[:, 0],
         mean=mean,
+        shift=spread * mean - weighted,
         covariance=covariance,
     )
 
@@ -289,21 +311,24 @@ def _weighted_sums(fraction: FloatArray, columns: FloatArray, scale: FloatArray)
     return sums
 
 
-def _isotropic(
-    mean_of_order: dict[int, FloatArray], product_of_orders: dict[tuple[int, int], FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Mean (k, n_moment) and covariance (k, n_moment, n_moment) of kernels turned at random."""
-    k = mean_of_order[2].size
-    mean = np.zeros((k, N_MOMENTS))
-    second = np.zeros((k, N_MOMENTS, N_MOMENTS))
+def _isotropic_means(of_order: FloatArray) -> FloatArray:
+    """Mean moments (k, n_moment) of kernels turned at random, from those of even order (k, 4)."""
+    mean = np.zeros((of_order.shape[0], N_MOMENTS))
     for i, (a, b) in enumerate(INDICES):
         if (a + b) % 2 == 0:
-            mean[:, i] = mean_of_order[a + b] * angular_mean(a, b)
+            mean[:, i] = of_order[:, _EVEN.index(a + b)] * angular_mean(a, b)
+    return mean
+
+
+def _isotropic_products(of_orders: FloatArray) -> FloatArray:
+    """Mean products of moments (k, n_moment, n_moment) of kernels turned at random, from (k, n_product)."""
+    second = np.zeros((of_orders.shape[0], N_MOMENTS, N_MOMENTS))
+    for i, (a, b) in enumerate(INDICES):
         for j, (c, d) in enumerate(INDICES):
             n, m = sorted((a + b, c + d))
             if (n + m) % 2 == 0:
-                second[:, i, j] = product_of_orders[n, m] * angular_mean(a + c, b + d)
-    return mean, second - mean[:, :, None] * mean[:, None, :]
+                second[:, i, j] = of_orders[:, _PRODUCTS.index((n, m))] * angular_mean(a + c, b + d)
+    return second
 
 
 def predict(moments: PopulationMoments, response: Response, n_stars: int | None = None) -> Prediction:
@@ -348,7 +373,7 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
         raise ValueError(f"n_stars must be at least 1, got {n_stars}")
     per_stack = 0.0 if n_stars is None else 1.0 / n_stars
     first, second = response.first, response.second
-    m, c = moments.mean, moments.covariance * per_stack
+    m, c = moments.mean + moments.shift * per_stack, moments.covariance * per_stack
     bending = np.einsum("ki,qij->qkj", m, second)
     bias = first @ m.T + 0.5 * (np.einsum("qkj,kj->qk", bending, m) + np.einsum("qij,kij->qk", second, c))
     gradient = first[:, None, :] + bending

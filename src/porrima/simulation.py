@@ -124,7 +124,11 @@ def population_of(config: PopulationConfig, stars: Stars) -> Population:
         What simulation and prediction start from.
     """
     return Population.of(
-        stars, multiplicity=config.multiplicity.build(), photometry=config.photometry.build(), cut=config.cut
+        stars,
+        multiplicity=config.multiplicity.build(),
+        photometry=config.photometry.build(),
+        cut=config.cut,
+        stack_weight=config.stack_weight,
     )
 
 

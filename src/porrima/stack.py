@@ -34,7 +34,7 @@ __all__ = ["BinaryFraction", "Stacks", "draw_stacks", "draw_systems"]
 BinaryFraction = float | Literal["uniform", "model"]
 """A number in [0, 1], ``uniform`` for one in (0, 1) per stack, ``model`` for the multiplicity model's own."""
 
-_FRACTION, _COUNT, _PAIR = 0, 1, 2  # the stages of a stack, each with a stream of its own
+_FRACTION, _COUNT, _PAIR, _SINGLE = 0, 1, 2, 3  # the stages of a stack, each with a stream of its own
 _MAX_SEED = 2**64
 
 
@@ -57,13 +57,14 @@ class Stacks:
 class _Tables(NamedTuple):
     """A population as the compiled loop reads it; stars in ascending order of multiplicity fraction."""
 
-    star: FloatArray  # (n, 11): see `_tables`
+    star: FloatArray  # (n, 12): see `_tables`
     track: NDArray[np.int64]  # (n, 4)
     grid: FloatArray
     log_mass_min: float
     log_dark: float
     cut: float
     isotropic: bool
+    equal_weights: bool
     group_fraction: FloatArray  # (g,) the distinct multiplicity fractions
     group_start: NDArray[np.int64]  # (g + 1,) first star of each
     group_sum: FloatArray  # (g + 1,) sum of the fractions of all stars before it
@@ -107,7 +108,7 @@ def draw_stacks(
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(last - first)
     sums = np.zeros((last - first, N_MOMENTS))
     _fill(_tables(population), np.uint64(seed), first, n_stars, fractions, scale, sums)
-    return Stacks(binary_fraction=fractions, moments=KernelMoments(values=sums / n_stars, n_stars=n_stars))
+    return Stacks(binary_fraction=fractions, moments=KernelMoments(values=sums, n_stars=n_stars))
 
 
 def draw_systems(
@@ -138,20 +139,10 @@ def draw_systems(
     """
     fractions = _fractions(population, n_stars, binary_fraction, seed, stack, stack + 1)
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(1)
-    pairs = np.zeros((n_stars, 3))
-    scratch = np.empty((2, N_MOMENTS))
-    _draw_stack(
-        _tables(population),
-        np.uint64(seed),
-        stack,
-        n_stars,
-        fractions[0],
-        scale[0],
-        scratch[0],
-        scratch[1],
-        pairs,
-    )
-    return Systems.from_pairs(*pairs.T)
+    listed = np.zeros((n_stars, 4))
+    tables, sums, powers = _tables(population), np.zeros(N_MOMENTS), np.empty(N_MOMENTS)
+    _draw_stack(tables, np.uint64(seed), stack, n_stars, fractions[0], scale[0], sums, powers, listed)
+    return Systems.from_pairs(*listed.T)
 
 
 def _fractions(
@@ -189,6 +180,7 @@ def _tables(population: Population) -> _Tables:
             np.log10(stars.mass),
             magnitudes(tracks, stars.mass[:, None])[:, 0],
             tracks.weight,
+            population.weight,
         ]
     )
     fraction, start = np.unique(law.multiplicity_fraction[order], return_index=True)
@@ -201,6 +193,7 @@ def _tables(population: Population) -> _Tables:
         log_dark=math.log10(tracks.dark_below) if tracks.dark_below > 0 else -math.inf,
         cut=population.cut,
         isotropic=population.projection == "isotropic",
+        equal_weights=bool(np.all(population.weight == 1.0)),
         group_fraction=fraction,
         group_start=np.append(start, order.size),
         group_sum=np.append(cumulative[start], cumulative[-1]),
@@ -240,6 +233,25 @@ def _draw_primary(tables, scale, u):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
+def _draw_single(tables, scale, u):  # type: ignore[no-untyped-def]
+    """Number of a star drawn in proportion to its probability 1 - min(1, scale x fraction) of being single."""
+    group_fraction, group_start, group_sum = tables.group_fraction, tables.group_start, tables.group_sum
+    capped = group_fraction.size
+    while capped > 0 and scale * group_fraction[capped - 1] >= 1.0:
+        capped -= 1
+    target = u * (group_start[capped] - scale * group_sum[capped])
+    low, high = 0, capped - 1  # the group that holds the target
+    while low < high:
+        middle = (low + high + 1) // 2
+        if group_start[middle] - scale * group_sum[middle] <= target:
+            low = middle
+        else:
+            high = middle - 1
+    inside = int((target - group_start[low] + scale * group_sum[low]) / (1.0 - scale * group_fraction[low]))
+    return min(group_start[low] + inside, group_start[low + 1] - 1)
+
+
+@njit(inline="always")
 def _log_mass_ratio(g, q_min_power, u):  # type: ignore[no-untyped-def]
     """log10 of a mass ratio with density q^(g-1) on [q_min, 1]; q_min_power is q_min^g (q_min if g is 0)."""
     if abs(g) > 1e-9:
@@ -260,8 +272,8 @@ def _flux_ratio(tables, star, track, log_q):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _add_moments(sums, powers, flux_ratio, dx, dy):  # type: ignore[no-untyped-def]
-    """Add the kernel moments of one pair; `powers` is scratch for the products dx^a dy^b."""
+def _add_moments(sums, powers, weight, flux_ratio, dx, dy):  # type: ignore[no-untyped-def]
+    """Add the weighted kernel moments of one pair; `powers` is scratch for the products dx^a dy^b."""
     primary = 1.0 / (1.0 + flux_ratio)
     companion = flux_ratio * primary
     near, far = -companion, primary  # c_n = primary (-companion)^n + companion primary^n
@@ -270,7 +282,7 @@ def _add_moments(sums, powers, flux_ratio, dx, dy):  # type: ignore[no-untyped-d
     for n in range(2, ORDER + 1):
         near *= -companion
         far *= primary
-        c = primary * near + companion * far
+        c = weight * (primary * near + companion * far)
         for k in range(first, first + n + 1):
             sums[k] += c * powers[k]
         following = first + n + 1
@@ -282,11 +294,11 @@ def _add_moments(sums, powers, flux_ratio, dx, dy):  # type: ignore[no-untyped-d
 
 
 @njit
-def _draw_stack(tables, seed, stack, n_stars, fraction, scale, sums, powers, pairs):  # type: ignore[no-untyped-def]
-    """Sum the moments of one stack; list its pairs (flux ratio, dx, dy) in `pairs` where that has rows."""
+def _draw_stack(tables, seed, stack, n_stars, fraction, scale, sums, powers, listed):  # type: ignore[no-untyped-def]
+    """Mean moments of one stack in `sums`; its systems (flux ratio, dx, dy, weight) in `listed` where that has rows."""
     key_low, key_high = _halves(seed)
     low, high = _halves(stack)
-    left, count_draw, pair_draw, listed = n_stars, 0, 0, 0
+    left, count_draw, pair_draw, kept, total = n_stars, 0, 0, 0, 0.0
     while left > 0:
         proposed, count_draw = binomial(left, fraction, key_low, key_high, _COUNT, low, high, count_draw)
         left = 0
@@ -306,10 +318,29 @@ def _draw_stack(tables, seed, stack, n_stars, fraction, scale, sums, powers, pai
             flux_ratio = _flux_ratio(tables, star, tables.track[number], log_q)
             angle = 2.0 * math.pi * uniform(b[2])
             dx, dy = separation * math.cos(angle), separation * math.sin(angle)
-            _add_moments(sums, powers, flux_ratio, dx, dy)
-            if pairs.shape[0] > 0:
-                pairs[listed, 0], pairs[listed, 1], pairs[listed, 2] = flux_ratio, dx, dy
-                listed += 1
+            _add_moments(sums, powers, star[11], flux_ratio, dx, dy)
+            total += star[11]
+            if listed.shape[0] > 0:
+                listed[kept, 0], listed[kept, 1], listed[kept, 2], listed[kept, 3] = (
+                    flux_ratio,
+                    dx,
+                    dy,
+                    star[11],
+                )
+            kept += 1
+    first_single = kept
+    if tables.equal_weights and listed.shape[0] == 0:  # single stars cost nothing
+        total, first_single = float(n_stars), n_stars
+    for single in range(first_single, n_stars):
+        weight = 1.0
+        if not tables.equal_weights:
+            words = philox(key_low, key_high, single, _SINGLE, low, high)
+            weight = tables.star[_draw_single(tables, scale, uniform_pair(words[0], words[1])), 11]
+        total += weight
+        if listed.shape[0] > 0:
+            listed[single, 3] = weight
+    for k in range(sums.size):
+        sums[k] /= total
 
 
 @njit(cache=True, parallel=True)
@@ -324,5 +355,5 @@ def _fill(tables, seed, first, n_stars, fractions, scale, sums):  # type: ignore
             scale[s],
             sums[s],
             np.empty(N_MOMENTS),
-            np.empty((0, 3)),
+            np.empty((0, 4)),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["BRIGHT_MASS", "Population", "Systems"]
+__all__ = ["BRIGHT_MASS", "Population", "StackWeight", "Systems"]
+
+StackWeight = Literal["equal", "flux"]
+"""How stars are weighted in a stack: all alike, or each by its flux."""
 
 BRIGHT_MASS = 1.5
 """Largest mass of a star kept, in M_sun: multiplicity is badly known above (KCM16 Sect. 4.3)."""
@@ -45,6 +48,8 @@ class Population:
         Orientation of the orbits.
     cut : float
         Projected separation at or above which a pair is resolved and leaves the sample, in arcsec.
+    weight : (n,) float array
+        Weight of each star's unit-flux image in a stack, dimensionless, with mean 1.
     """
 
     stars: Stars
@@ -52,6 +57,7 @@ class Population:
     tracks: Tracks
     projection: Projection
     cut: float
+    weight: FloatArray
 
     @classmethod
     def of(
@@ -61,6 +67,7 @@ class Population:
         multiplicity: MultiplicityModel,
         photometry: MassLuminosity,
         cut: float = 0.05,
+        stack_weight: StackWeight = "equal",
     ) -> Population:
         """Population of given stars.
 
@@ -74,6 +81,8 @@ class Population:
             Gives flux ratios, in the band of the stars.
         cut : float
             Separation from which a pair is resolved, in arcsec, positive.
+        stack_weight : {"equal", "flux"}
+            Whether every star counts alike in a stack, or in proportion to its flux.
 
         Returns
         -------
@@ -94,7 +103,11 @@ class Population:
             tracks = photometry.tracks(stars.mass, stars.metallicity, stars.log_age, stars.band)
         except ValueError as error:
             raise InputError(str(error), source=stars.source or None) from None
-        return cls(stars=stars, law=law, tracks=tracks, projection=multiplicity.projection, cut=cut)
+        flux = 10.0 ** (-0.4 * (stars.magnitude - stars.magnitude.min()))
+        weight = flux / flux.mean() if stack_weight == "flux" else np.ones(len(stars))
+        return cls(
+            stars=stars, law=law, tracks=tracks, projection=multiplicity.projection, cut=cut, weight=weight
+        )
 
     def scale(self, binary_fraction: FloatArray | None) -> FloatArray:
         """Factor on all multiplicity fractions for each wanted binary fraction; see `multiplicity_scale`.
