@@ -1,7 +1,18 @@
 """Fixtures that several tests share."""
 
+import hashlib
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
+
+# numba's cache looks at the file of a compiled function, not at those of what is inlined in it: a cache per source
+ROOT = Path(__file__).parents[1]
+SOURCE = hashlib.sha256(
+    b"".join(p.read_bytes() for p in sorted((ROOT / "src" / "porrima").glob("*.py")))
+).hexdigest()
+os.environ["NUMBA_CACHE_DIR"] = str(ROOT / ".numba_cache" / SOURCE[:16])
 
 from porrima.multiplicity import MULTIPLICITY
 from porrima.photometry import PHOTOMETRY

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy import stats
-from scipy.special import ndtri
 
-from porrima.streams import binomial, inverse_normal, philox, uniform, uniform_pair
+from porrima.streams import binomial, philox, uniform_pair
 
 
 @njit
@@ -21,20 +20,12 @@ def counts(n, p, size):
 
 
 @njit
-def deviates(p):
-    out = np.empty(p.size)
-    for i in range(p.size):
-        out[i] = inverse_normal(p[i])
-    return out
-
-
-@njit
 def many(size):
     out = np.empty((size, 4))
     for i in range(size):
         w = philox(5, 6, i, 2, 3, 4)
         for k in range(4):
-            out[i, k] = uniform(w[k])
+            out[i, k] = w[k] * 2.0**-32
     return out
 
 
@@ -57,7 +48,6 @@ def test_philox_gives_the_published_answers(arguments, expected):
 
 
 def test_uniforms_never_reach_their_ends():
-    assert 0 < uniform.py_func(0) < uniform.py_func(FULL) < 1
     assert uniform_pair.py_func(np.uint32(0), np.uint32(0)) > 0
     assert uniform_pair.py_func(np.uint32(FULL), np.uint32(FULL)) < 1
 
@@ -68,13 +58,6 @@ def test_uniforms_are_uniform_and_uncorrelated():
         assert stats.kstest(u[:, k], "uniform").pvalue > 1e-6
     correlation = np.corrcoef(u.T) - np.eye(4)
     assert np.abs(correlation).max() < 5 / np.sqrt(u.shape[0])
-
-
-def test_normal_deviates_against_scipy():
-    p = np.concatenate(
-        [np.linspace(1e-4, 1 - 1e-4, 9999), 10.0 ** -np.arange(5, 300, 7), 1 - 10.0 ** -np.arange(5, 12)]
-    )
-    np.testing.assert_allclose(deviates(p), ndtri(p), rtol=1e-14, atol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,10 @@ import math
 from typing import Literal
 
 import numpy as np
-from numba import njit
+from numba import float32, njit
 from numpy.typing import NDArray
+
+from porrima.elementary import sine_cosine
 
 FloatArray = NDArray[np.float64]
 Projection = Literal["isotropic", "inclination-uniform"]
@@ -15,17 +17,16 @@ Projection = Literal["isotropic", "inclination-uniform"]
 __all__ = ["Projection", "projection_factor", "projection_nodes"]
 
 
-@njit(inline="always")
+@njit(inline="always", fastmath={"contract"})
 def projection_factor(isotropic, u, v):  # type: ignore[no-untyped-def]
-    """Projected separation over semi-major axis, from one or two uniform numbers in (0, 1) (compiled).
+    """Projected separation over semi-major axis, float32, from one or two uniform numbers in (0, 1) (compiled).
 
     A companion on a circular isotropic orbit lies anywhere on a sphere: sqrt(1 - mu^2), mu uniform.
     With the inclination i itself uniform in angle: sqrt(1 - sin^2 i sin^2 theta), theta the uniform phase.
     """
-    if isotropic:
-        return math.sqrt(1.0 - u * u)
-    s = math.sin(0.5 * math.pi * u) * math.sin(0.5 * math.pi * v)
-    return math.sqrt(1.0 - s * s)
+    half = float32(0.5)
+    product = u if isotropic else sine_cosine(half * u)[0] * sine_cosine(half * v)[0]
+    return np.sqrt((float32(1) - product) * (float32(1) + product))
 
 
 def projection_nodes(projection: Projection) -> tuple[FloatArray, FloatArray]:

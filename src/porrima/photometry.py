@@ -226,7 +226,7 @@ class HabetsHeintze1981:
         index = np.zeros((mass.size, 4), dtype=np.int64)
         if self.branch == "primary":
             log_mass = np.log10(mass)
-            index[:, 0] = np.where(log_mass > 0.13, 1, np.where(log_mass > -0.62, 2, 3))
+            index[:] = np.where(log_mass > 0.13, 1, np.where(log_mass > -0.62, 2, 3))[:, None]
         return Tracks(
             log_mass_min=log_mass_min,
             magnitude=np.ascontiguousarray(np.column_stack([own, branches])),
@@ -268,7 +268,7 @@ class MainSequence:
     @property
     def bands(self) -> tuple[str, ...]:
         """Names of the bands: g, r, i, z, euclid_VIS (AB), gaia_G and roman_F... (Vega-like)."""
-        return tuple(_photometry_table()["bands"])
+        return tuple(name for name in _photometry_table() if name not in _NOT_BANDS)
 
     def tracks(self, mass: FloatArray, metallicity: FloatArray, log_age: FloatArray, band: str) -> Tracks:
         """Tracks of one band and the place in them of each star.
@@ -333,6 +333,8 @@ class MainSequence:
         return mass
 
 
+_NOT_BANDS = ("mh", "log_age", "mass", "log_teff")
+
 PHOTOMETRY: dict[str, MassLuminosity] = {
     "main-sequence": MainSequence(),
     "habets-heintze": HabetsHeintze1981(),
@@ -357,27 +359,25 @@ def _oldest(turn_off: FloatArray, age: FloatArray, mass: FloatArray) -> FloatArr
 
 
 @cache
-def _photometry_table() -> dict[str, list[str] | dict[str, FloatArray]]:
+def _photometry_table() -> dict[str, FloatArray]:
+    """Columns of the shipped table."""
     from astropy.table import Table  # noqa: PLC0415  (slow to import, read once)
 
     path = files("porrima") / "data" / "main_sequence_photometry.ecsv"
     table = Table.read(str(path), format="ascii.ecsv")
-    columns = {name: np.asarray(table[name], dtype=float) for name in table.colnames}
-    bands = [name for name in table.colnames if name not in ("mh", "log_age", "mass", "log_teff")]
-    return {"bands": bands, "columns": columns}
+    return {name: np.asarray(table[name], dtype=float) for name in table.colnames}
 
 
 @cache
 def _main_sequence_grid(band: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Magnitudes (n_grid, n_mh n_age), turn-off masses (n_mh, n_age), metallicities and log10 ages."""
-    columns = _photometry_table()["columns"]
-    assert_columns: dict[str, FloatArray] = columns  # type: ignore[assignment]
-    mh, age = np.unique(assert_columns["mh"]), np.unique(assert_columns["log_age"])
+    columns = _photometry_table()
+    mh, age = np.unique(columns["mh"]), np.unique(columns["log_age"])
     raw = {}
     for z in mh:
         for t in age:
-            rows = (assert_columns["mh"] == z) & (assert_columns["log_age"] == t)
-            raw[z, t] = (assert_columns["mass"][rows], assert_columns[band][rows])
+            rows = (columns["mh"] == z) & (columns["log_age"] == t)
+            raw[z, t] = (columns["mass"][rows], columns[band][rows])
     raw[-1.0, 9.8] = _continued(raw[-1.0, 9.8], raw[-1.5, 9.8], raw[-0.5, 9.8])
     solar = raw[0.0, age[0]][1]
     n_grid = 1 + round(np.log10(1.5 / 0.08) / STEP + 0.5)

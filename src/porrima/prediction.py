@@ -7,7 +7,7 @@ them into the bias and the scatter of the measured shape, for any number of star
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -226,13 +226,7 @@ def _flux_ratio_nodes(population: Population, some: slice) -> tuple[FloatArray, 
     power = np.where(np.abs(g) > 1e-9, g, 1.0)
     norm = np.where(np.abs(g) > 1e-9, (1 - q_min**power) / power, -np.log(q_min))
     tracks = population.tracks
-    some_tracks = type(tracks)(
-        log_mass_min=tracks.log_mass_min,
-        magnitude=tracks.magnitude,
-        dark_below=tracks.dark_below,
-        index=tracks.index[some],
-        weight=tracks.weight[some],
-    )
+    some_tracks = replace(tracks, index=tracks.index[some], weight=tracks.weight[some])
     f = np.where(span > 0, flux_ratio(some_tracks, mass, q), 0.0)
     return f, panel_weight * span * q**g / norm
 

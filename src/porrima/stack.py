@@ -10,16 +10,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numba import njit, prange
 from scipy.special import ndtr
 
-from porrima.moments import N_MOMENTS, ORDER, KernelMoments
-from porrima.orbits import projection_factor
-from porrima.photometry import magnitude_on_track, magnitudes
-from porrima.streams import binomial, inverse_normal, philox, uniform, uniform_pair
+from porrima.moments import INDICES, N_MOMENTS, KernelMoments
+from porrima.pairs import (
+    FLUX_RATIO,
+    FRACTION,
+    KEPT,
+    LANES,
+    SEPARATION,
+    VALID,
+    WEIGHT,
+    Tables,
+    X,
+    Y,
+    alias_table,
+    draw_block,
+    flush,
+    scratch,
+    sum_block,
+)  # fmt: skip
+from porrima.photometry import STEP, magnitudes
+from porrima.streams import binomial, philox, uniform_pair
 from porrima.systems import Systems
 
 if TYPE_CHECKING:
@@ -36,6 +52,8 @@ BinaryFraction = float | Literal["uniform", "model"]
 
 _FRACTION, _COUNT, _PAIR, _SINGLE = 0, 1, 2, 3  # the stages of a stack, each with a stream of its own
 _MAX_SEED = 2**64
+_BATCH = 64  # stacks that share one thread's room
+_BLOCKS_IN_FLOAT32 = 8  # sums of more blocks than these go on in float64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,22 +70,6 @@ class Stacks:
 
     binary_fraction: FloatArray
     moments: KernelMoments
-
-
-class _Tables(NamedTuple):
-    """A population as the compiled loop reads it; stars in ascending order of multiplicity fraction."""
-
-    star: FloatArray  # (n, 12): see `_tables`
-    track: NDArray[np.int64]  # (n, 4)
-    grid: FloatArray
-    log_mass_min: float
-    log_dark: float
-    cut: float
-    isotropic: bool
-    equal_weights: bool
-    group_fraction: FloatArray  # (g,) the distinct multiplicity fractions
-    group_start: NDArray[np.int64]  # (g + 1,) first star of each
-    group_sum: FloatArray  # (g + 1,) sum of the fractions of all stars before it
 
 
 def draw_stacks(
@@ -107,7 +109,8 @@ def draw_stacks(
     fractions = _fractions(population, n_stars, binary_fraction, seed, first, last)
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(last - first)
     sums = np.zeros((last - first, N_MOMENTS))
-    _fill(_tables(population), np.uint64(seed), first, n_stars, fractions, scale, sums)
+    unit = np.array([population.cut ** (a + b) for a, b in INDICES])
+    _fill(_tables(population), np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
     return Stacks(binary_fraction=fractions, moments=KernelMoments(values=sums, n_stars=n_stars))
 
 
@@ -139,10 +142,12 @@ def draw_systems(
     """
     fractions = _fractions(population, n_stars, binary_fraction, seed, stack, stack + 1)
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(1)
-    listed = np.zeros((n_stars, 4))
-    tables, sums, powers = _tables(population), np.zeros(N_MOMENTS), np.empty(N_MOMENTS)
-    _draw_stack(tables, np.uint64(seed), stack, n_stars, fractions[0], scale[0], sums, powers, listed)
-    return Systems.from_pairs(*listed.T)
+    listed, sums = np.zeros((n_stars, 4)), np.zeros(N_MOMENTS)
+    _draw_stack(
+        _tables(population), scratch(), np.uint64(seed), stack, n_stars, fractions[0], scale[0], sums, listed
+    )
+    flux_ratio, dx, dy, weight = listed.T
+    return Systems.from_pairs(flux_ratio, dx * population.cut, dy * population.cut, weight)
 
 
 def _fractions(
@@ -166,37 +171,40 @@ def _fractions(
     return np.full(last - first, float(binary_fraction))
 
 
-def _tables(population: Population) -> _Tables:
+def _tables(population: Population) -> Tables:
     law, tracks, stars = population.law, population.tracks, population.stars
-    order = np.argsort(law.multiplicity_fraction, kind="stable")
+    offset = tracks.index[0] - tracks.index[0, 0]
+    if np.any(tracks.index - tracks.index[:, :1] != offset):
+        raise ValueError(f"tracks must lie alike for all stars, got {tracks.index}")
     g = law.mass_ratio_exponent + 1
-    star = np.column_stack(
-        [
-            law.log_a - np.log10(stars.distance),  # au / pc = arcsec
-            law.log_a_sigma,
-            ndtr((law.log_a_max - law.log_a) / law.log_a_sigma),
-            g,
-            np.where(np.abs(g) > 1e-9, law.mass_ratio_min**g, law.mass_ratio_min),
-            np.log10(stars.mass),
-            magnitudes(tracks, stars.mass[:, None])[:, 0],
-            tracks.weight,
-            population.weight,
-        ]
-    )
-    fraction, start = np.unique(law.multiplicity_fraction[order], return_index=True)
-    cumulative = np.concatenate([[0.0], np.cumsum(law.multiplicity_fraction[order])])
-    return _Tables(
-        star=np.ascontiguousarray(star[order]),
-        track=np.ascontiguousarray(tracks.index[order]),
-        grid=tracks.magnitude,
-        log_mass_min=tracks.log_mass_min,
-        log_dark=math.log10(tracks.dark_below) if tracks.dark_below > 0 else -math.inf,
-        cut=population.cut,
+    power_law = np.abs(g) > 1e-9
+    log2_10, magnitude_to_log2 = math.log2(10.0), -0.4 * math.log2(10.0)
+    columns = [
+        (law.log_a - np.log10(stars.distance)) * log2_10 - math.log2(population.cut),  # au / pc = arcsec
+        law.log_a_sigma * log2_10,
+        ndtr((law.log_a_max - law.log_a) / law.log_a_sigma),
+        np.divide(1.0, g, out=np.zeros_like(g), where=power_law),
+        np.where(power_law, law.mass_ratio_min ** np.where(power_law, g, 1.0), 1.0),
+        np.where(power_law, 0.0, np.log2(law.mass_ratio_min)),
+        np.log2(stars.mass),
+        magnitudes(tracks, stars.mass[:, None])[:, 0] * magnitude_to_log2,
+        *tracks.weight.T,
+        tracks.index[:, 0],
+        population.weight,
+        law.multiplicity_fraction,
+    ]
+    stay, alias = alias_table(law.multiplicity_fraction)
+    return Tables(
+        star=np.stack(columns, axis=1).astype(np.float32),
+        grid=(tracks.magnitude * magnitude_to_log2).astype(np.float32),
+        grid_start=np.float32(tracks.log_mass_min * log2_10),
+        grid_step=np.float32(STEP * log2_10),
+        track_offset=offset.astype(np.int32),
+        log_dark=np.float32(math.log2(tracks.dark_below) if tracks.dark_below > 0 else -math.inf),
         isotropic=population.projection == "isotropic",
         equal_weights=bool(np.all(population.weight == 1.0)),
-        group_fraction=fraction,
-        group_start=np.append(start, order.size),
-        group_sum=np.append(cumulative[start], cumulative[-1]),
+        stay=stay,
+        alias=alias,
     )
 
 
@@ -215,145 +223,80 @@ def _uniform_fractions(seed, first, fractions):  # type: ignore[no-untyped-def]
         fractions[s] = uniform_pair(words[0], words[1])
 
 
-@njit(inline="always")
-def _draw_primary(tables, scale, u):  # type: ignore[no-untyped-def]
-    """Number of a star drawn in proportion to its probability min(1, scale x fraction) of being a pair."""
-    group_fraction, group_start, group_sum = tables.group_fraction, tables.group_start, tables.group_sum
-    capped = group_fraction.size  # first group whose stars are all pairs
-    while capped > 0 and scale * group_fraction[capped - 1] >= 1.0:
-        capped -= 1
-    below = scale * group_sum[capped]
-    target = u * (below + (group_start[-1] - group_start[capped]))
-    if target >= below:
-        return min(group_start[capped] + int(target - below), group_start[-1] - 1)
-    target /= scale
-    group = np.searchsorted(group_sum[: capped + 1], target, side="right") - 1
-    inside = int((target - group_sum[group]) / group_fraction[group])
-    return min(group_start[group] + inside, group_start[group + 1] - 1)
-
-
-@njit(inline="always")
-def _draw_single(tables, scale, u):  # type: ignore[no-untyped-def]
-    """Number of a star drawn in proportion to its probability 1 - min(1, scale x fraction) of being single."""
-    group_fraction, group_start, group_sum = tables.group_fraction, tables.group_start, tables.group_sum
-    capped = group_fraction.size
-    while capped > 0 and scale * group_fraction[capped - 1] >= 1.0:
-        capped -= 1
-    target = u * (group_start[capped] - scale * group_sum[capped])
-    low, high = 0, capped - 1  # the group that holds the target
-    while low < high:
-        middle = (low + high + 1) // 2
-        if group_start[middle] - scale * group_sum[middle] <= target:
-            low = middle
-        else:
-            high = middle - 1
-    inside = int((target - group_start[low] + scale * group_sum[low]) / (1.0 - scale * group_fraction[low]))
-    return min(group_start[low] + inside, group_start[low + 1] - 1)
-
-
-@njit(inline="always")
-def _log_mass_ratio(g, q_min_power, u):  # type: ignore[no-untyped-def]
-    """log10 of a mass ratio with density q^(g-1) on [q_min, 1]; q_min_power is q_min^g (q_min if g is 0)."""
-    if abs(g) > 1e-9:
-        return math.log10(q_min_power + u * (1.0 - q_min_power)) / g
-    return (1.0 - u) * math.log10(q_min_power)
-
-
-@njit(inline="always")
-def _flux_ratio(tables, star, track, log_q):  # type: ignore[no-untyped-def]
-    log_mass = star[5] + log_q
-    if log_mass < tables.log_dark:
-        return 0.0
-    companion = magnitude_on_track(
-        tables.grid, tables.log_mass_min, log_mass,
-        track[0], track[1], track[2], track[3], star[7], star[8], star[9], star[10],
-    )  # fmt: skip
-    return min(math.exp(-0.4 * math.log(10.0) * (companion - star[6])), 1.0)
-
-
-@njit(inline="always")
-def _add_moments(sums, powers, weight, flux_ratio, dx, dy):  # type: ignore[no-untyped-def]
-    """Add the weighted kernel moments of one pair; `powers` is scratch for the products dx^a dy^b."""
-    primary = 1.0 / (1.0 + flux_ratio)
-    companion = flux_ratio * primary
-    near, far = -companion, primary  # c_n = primary (-companion)^n + companion primary^n
-    powers[0], powers[1], powers[2] = dx * dx, dx * dy, dy * dy
-    first = 0
-    for n in range(2, ORDER + 1):
-        near *= -companion
-        far *= primary
-        c = weight * (primary * near + companion * far)
-        for k in range(first, first + n + 1):
-            sums[k] += c * powers[k]
-        following = first + n + 1
-        if n < ORDER:
-            for k in range(n + 1):
-                powers[following + k] = powers[first + k] * dx
-            powers[following + n + 1] = powers[following - 1] * dy
-        first = following
-
-
 @njit
-def _draw_stack(tables, seed, stack, n_stars, fraction, scale, sums, powers, listed):  # type: ignore[no-untyped-def]
-    """Mean moments of one stack in `sums`; its systems (flux ratio, dx, dy, weight) in `listed` where that has rows."""
+def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, listed):  # type: ignore[no-untyped-def]
+    """Mean moments of one stack in `sums`, lengths over the cut; its systems in `listed` where that has rows.
+
+    The pairs of a stack are one stream.  As many are taken as the binomial draw says; for each that is resolved
+    another star is drawn, which is a pair with the same probability, until none is.
+    """
     key_low, key_high = _halves(seed)
     low, high = _halves(stack)
-    left, count_draw, pair_draw, kept, total = n_stars, 0, 0, 0, 0.0
-    while left > 0:
-        proposed, count_draw = binomial(left, fraction, key_low, key_high, _COUNT, low, high, count_draw)
-        left = 0
-        for _ in range(proposed):
-            a = philox(key_low, key_high, pair_draw, _PAIR, low, high)
-            b = philox(key_low, key_high, pair_draw + 1, _PAIR, low, high)
-            pair_draw += 2
-            number = _draw_primary(tables, scale, uniform_pair(a[0], a[1]))
-            star = tables.star[number]
-            log_separation = star[0] + star[1] * inverse_normal(star[2] * uniform(a[2]))
-            separation = math.exp(math.log(10.0) * log_separation)
-            separation *= projection_factor(tables.isotropic, uniform(b[0]), uniform(b[1]))
-            if separation >= tables.cut:
-                left += 1
-                continue
-            log_q = _log_mass_ratio(star[3], star[4], uniform(a[3]))
-            flux_ratio = _flux_ratio(tables, star, tables.track[number], log_q)
-            angle = 2.0 * math.pi * uniform(b[2])
-            dx, dy = separation * math.cos(angle), separation * math.sin(angle)
-            _add_moments(sums, powers, star[11], flux_ratio, dx, dy)
-            total += star[11]
-            if listed.shape[0] > 0:
-                listed[kept, 0], listed[kept, 1], listed[kept, 2], listed[kept, 3] = (
-                    flux_ratio,
-                    dx,
-                    dy,
-                    star[11],
-                )
-            kept += 1
-    first_single = kept
-    if tables.equal_weights and listed.shape[0] == 0:  # single stars cost nothing
-        total, first_single = float(n_stars), n_stars
-    for single in range(first_single, n_stars):
-        weight = 1.0
-        if not tables.equal_weights:
-            words = philox(key_low, key_high, single, _SINGLE, low, high)
-            weight = tables.star[_draw_single(tables, scale, uniform_pair(words[0], words[1])), 11]
-        total += weight
-        if listed.shape[0] > 0:
-            listed[single, 3] = weight
+    wanted, draw = binomial(n_stars, fraction, key_low, key_high, _COUNT, low, high, 0)
+    pair = block.pair
+    taken, filled, resolved, kept, total, lane = 0, 0, 0, 0, 0.0, LANES
+    while wanted > 0:
+        if lane == LANES:
+            if taken > 0:
+                sum_block(pair, block.sums)
+                filled += 1
+                if filled % _BLOCKS_IN_FLOAT32 == 0:
+                    flush(block.sums, sums)
+            draw_block(tables, block, scale, key_low, key_high, _PAIR, low, high, taken)
+            lane = 0
+        if pair[VALID + lane] > np.float32(0):
+            wanted -= 1
+            if pair[SEPARATION + lane] >= np.float32(1):
+                resolved += 1
+            else:
+                weight = block.star[WEIGHT + lane]
+                pair[KEPT + lane] = weight
+                total += weight
+                if listed.shape[0] > 0:
+                    listed[kept, 0], listed[kept, 3] = pair[FLUX_RATIO + lane], weight
+                    listed[kept, 1], listed[kept, 2] = pair[X + lane], pair[Y + lane]
+                kept += 1
+        lane += 1
+        taken += 1
+        if wanted == 0 and resolved > 0:
+            wanted, draw = binomial(resolved, fraction, key_low, key_high, _COUNT, low, high, draw)
+            resolved = 0
+    if taken > 0:
+        sum_block(block.pair, block.sums)
+        flush(block.sums, sums)
+    total += _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, listed)
     for k in range(sums.size):
         sums[k] /= total
 
 
+@njit
+def _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, listed):  # type: ignore[no-untyped-def]
+    """Total weight of the single stars of a stack, each listed where `listed` has rows."""
+    if tables.equal_weights and listed.shape[0] == 0:  # single stars cost nothing
+        return float(n_stars - kept)
+    total, draw = 0.0, 0
+    for single in range(kept, n_stars):
+        weight = 1.0
+        while not tables.equal_weights:  # any star, kept with its probability of being single
+            words = philox(key_low, key_high, draw, _SINGLE, low, high)
+            draw += 1
+            star = tables.star[int((np.uint64(words[0]) * np.uint64(tables.stay.size)) >> np.uint64(32))]
+            if uniform_pair(words[1], words[2]) >= scale * star[FRACTION // LANES]:
+                weight = float(star[WEIGHT // LANES])
+                break
+        total += weight
+        if listed.shape[0] > 0:
+            listed[single, 3] = weight
+    return total
+
+
 @njit(cache=True, parallel=True)
-def _fill(tables, seed, first, n_stars, fractions, scale, sums):  # type: ignore[no-untyped-def]
-    for s in prange(fractions.size):
-        _draw_stack(
-            tables,
-            seed,
-            first + s,
-            n_stars,
-            fractions[s],
-            scale[s],
-            sums[s],
-            np.empty(N_MOMENTS),
-            np.empty((0, 4)),
-        )
+def _fill(tables, seed, first, n_stars, fractions, scale, unit, sums):  # type: ignore[no-untyped-def]
+    """Stacks of a range, a few at a time on each thread; `unit` turns lengths over the cut to arcsec."""
+    n_batches = (fractions.size + _BATCH - 1) // _BATCH
+    for batch in prange(n_batches):
+        block, listed = scratch(), np.empty((0, 4))
+        for s in range(batch * _BATCH, min((batch + 1) * _BATCH, fractions.size)):
+            _draw_stack(tables, block, seed, first + s, n_stars, fractions[s], scale[s], sums[s], listed)
+            for k in range(sums.shape[1]):
+                sums[s, k] *= unit[k]
