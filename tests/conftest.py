@@ -20,6 +20,14 @@ from porrima.stars import Stars
 from porrima.systems import Population
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory):
+    """A cache that is empty at first and that no other run shares."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PORRIMA_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def stars():
     """Three hundred stars of all kinds, as a magnitude bin holds them."""

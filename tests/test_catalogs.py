@@ -3,6 +3,7 @@
 import gzip
 import io
 import os
+import sys
 import warnings
 from pathlib import Path
 
@@ -13,10 +14,13 @@ from hypothesis import strategies as st
 
 from data_files import data_file
 from porrima import stars as stars_module
+from porrima import tables
 from porrima.besancon import COMPONENT_AGES, sdss_i
 from porrima.catalogs import READERS, read_catalog, write_stars
 from porrima.errors import InputError
 from porrima.stars import Stars
+from test_gaia import CSV as GAIA
+from test_trilegal import TRILEGAL
 
 POLE = "catalogues/besancon_l200_b90.dat"
 JOHNSON = "catalogues/besancon_l200_b59.csv"
@@ -396,6 +400,59 @@ def test_writing_into_a_folder_that_is_not_there_is_an_input_error(tmp_path):
         write_stars(stars, tmp_path)
 
 
+# ---------------------------------------------------------------- what is on the main sequence, and large files
+
+
+def test_brown_dwarfs_are_counted_so_that_they_do_not_stop_a_command(tmp_path):
+    catalog = read_catalog(saved(tmp_path, CSV + "0.05,10,18,0,9,thin5\n0.08,10,18,0,9,thin5\n"))
+    assert catalog.stars.mass.tolist() == [0.5, 1.0, 0.08]
+    assert catalog.rejected == {"below 0.08 M_sun": 1}
+
+
+def test_large_fits_file_is_read_in_pieces_with_the_columns_in_use_only(tmp_path, monkeypatch):
+    from astropy.table import Table  # noqa: PLC0415
+
+    rng = np.random.Generator(np.random.Philox(3))
+    n = 1000
+    table = Table({f"x{k}": rng.normal(size=n) for k in range(20)})
+    table["M"] = rng.uniform(0.1, 1.0, n)
+    table["D"] = rng.uniform(0.1, 2.0, n)
+    table["D"].unit = "kpc"
+    table["i"] = np.ma.masked_greater(rng.integers(15, 20, n), 18)
+    table["component"] = rng.choice(["thin5", "halo"], n)
+    table.meta["BAND"] = "z"
+    path = tmp_path / "large.fits"
+    table.write(path)
+    columns = {"mass": "M", "distance": "D", "magnitude": "i"}
+    whole = read_catalog(path, columns=columns)
+    monkeypatch.setattr(tables, "_PIECE", 50_000)
+    pieces = read_catalog(path, columns=columns)
+    assert whole.rejected == pieces.rejected == {"no magnitude": int(np.sum(table["i"].mask))}
+    for name in ("mass", "distance", "magnitude", "component"):
+        np.testing.assert_array_equal(getattr(whole.stars, name), getattr(pieces.stars, name))
+    assert pieces.stars.band == "z"
+    np.testing.assert_allclose(pieces.stars.distance, 1000 * np.asarray(table["D"])[~table["i"].mask])
+    with pytest.raises(InputError, match="column mass: must be in the table, for mass; it has x0, x1, x2"):
+        read_catalog(path)
+
+
+def test_parquet_is_read_where_its_package_is_installed(tmp_path):
+    pytest.importorskip("pyarrow")
+    from astropy.table import Table  # noqa: PLC0415
+
+    table = Table.read(GAIA, format="ascii.csv")
+    table.write(tmp_path / "t", format="parquet")
+    catalog = read_catalog(tmp_path / "t")
+    assert catalog.format == "gaia"
+    np.testing.assert_array_equal(catalog.stars.mass, read_catalog(saved(tmp_path, GAIA)).stars.mass)
+
+
+def test_parquet_without_its_package_is_said_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"is a Parquet file, which needs the package pyarrow: install it"):
+        read_catalog(saved(tmp_path, b"PAR1" + bytes(100) + b"PAR1"))
+
+
 # ---------------------------------------------------------------- broken files
 
 ROW = BESANCON.splitlines()[4]
@@ -501,6 +558,18 @@ BROKEN = {  # what is wrong: (content, the end of the message)
         ", row 1: must be a header line that names the columns, got 0.5,100,18",
     ),
     "comments only": ("# nothing\n", ": must have a header line and rows"),
+    "distance in pc for kpc": (
+        replaced(" 49.990 ", " 49990. "),
+        ", row 8, column Dist: must be in kpc and no more than the 50.0 of the header, got 49990",
+    ),
+    "csv distance in kpc": (
+        in_csv("100.0", "0.1"),
+        ", row 2, column distance: must be from 1 to 2e+06 pc (is it in pc?), got 0.1",
+    ),
+    "csv mass in kg": (
+        in_csv("1.0,", "1.99e30,"),
+        ", row 3, column mass: must be no more than 500 M_sun (is it in M_sun?), got 1.99e+30",
+    ),
     "no mass anywhere": (
         in_csv("0.5,", "0,").replace("1.0,", "0,"),
         f": {NO_STAR}, got 2 no mass",
@@ -557,18 +626,20 @@ def test_what_is_no_file_is_refused(tmp_path):
 
 
 def test_file_that_may_not_be_read_is_refused(tmp_path, monkeypatch):
-    def refused(_):
+    def refused(*_):
         raise PermissionError(13, "Permission denied")
 
     path = saved(tmp_path, CSV)
-    monkeypatch.setattr(Path, "read_bytes", refused)  # for root there is no such file
+    monkeypatch.setattr(Path, "open", refused)  # for root there is no such file
     with pytest.raises(InputError, match=r"must be a readable file, got Permission denied$"):
         read_catalog(path)
 
 
 def test_wrong_options_are_refused_by_name(tmp_path):
     path = saved(tmp_path, CSV)
-    with pytest.raises(InputError, match=r"^format: must be one of besancon, table, got trilegall$"):
+    with pytest.raises(
+        InputError, match=r"^format: must be one of besancon, trilegal, gaia, table, got trilegall$"
+    ):
         read_catalog(path, format="trilegall")
     with pytest.raises(InputError, match=r"^columns: must be one of mass, distance, .*, got weight$"):
         read_catalog(path, columns={"weight": "mass"})
@@ -580,6 +651,11 @@ def test_wrong_options_are_refused_by_name(tmp_path):
         read_catalog(saved(tmp_path, BESANCON), columns={"mass": "Mass"})
     with pytest.raises(InputError, match="must have the header line of the Besançon model"):
         read_catalog(saved(tmp_path, CSV), format="besancon")
+    for content in (CSV, BESANCON):
+        with pytest.raises(
+            InputError, match=r"^options: must be one of none, for this format, got binaries$"
+        ):
+            read_catalog(saved(tmp_path, content), options={"binaries": "drop"})
 
 
 # ---------------------------------------------------------------- anything at all
@@ -608,9 +684,9 @@ def test_random_bytes_raise_nothing_but_input_errors(tmp_path, content, form):
 
 
 @given(
-    start=st.sampled_from(["besancon", "csv", "ecsv", "fits", "votable"]),
+    start=st.sampled_from(["besancon", "csv", "ecsv", "fits", "votable", "trilegal", "gaia", "gaia-ecsv"]),
     edits=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 10**6), JUNK), min_size=1, max_size=4),
-    band=st.sampled_from([None, "i", "V", "x"]),
+    band=st.sampled_from([None, "i", "V", "gaia_G", "x"]),
 )
 @FUZZ
 def test_mutated_files_raise_nothing_but_input_errors(tmp_path, start, edits, band):
@@ -622,15 +698,22 @@ def test_mutated_files_raise_nothing_but_input_errors(tmp_path, start, edits, ba
 
 
 @given(
-    edits=st.lists(st.tuples(st.integers(0, 11), st.integers(0, 17), JUNK), min_size=1, max_size=3),
-    band=st.sampled_from(["i", "V"]),
+    start=st.sampled_from(["besancon", "trilegal", "gaia"]),
+    edits=st.lists(st.tuples(st.integers(0, 11), st.integers(0, 60), JUNK), min_size=1, max_size=3),
+    band=st.sampled_from([None, "i", "V"]),
+    options=st.sampled_from([{}, {"binaries": "drop"}, {"ruwe_max": 1.4}, {"log_age": "1e1"}]),
 )
 @FUZZ
-def test_fields_of_a_catalogue_replaced_by_junk_raise_nothing_but_input_errors(tmp_path, edits, band):
-    lines = [line.split(" ") for line in BESANCON.splitlines()]
+def test_fields_of_a_catalogue_replaced_by_junk_raise_nothing_but_input_errors(
+    tmp_path, start, edits, band, options
+):
+    mark = "," if start == "gaia" else " "
+    lines = [line.split(mark) for line in seeds()[start].decode().splitlines()]
     for row, field, junk in edits:
-        lines[row][field % len(lines[row])] = junk
-    only_input_errors(saved(tmp_path, "\n".join(" ".join(line) for line in lines)), band=band)
+        line = lines[row % len(lines)]
+        line[field % len(line)] = junk
+    content = "\n".join(mark.join(line) for line in lines)
+    only_input_errors(saved(tmp_path, content), band=band, options=options)
 
 
 def seeds():
@@ -640,6 +723,10 @@ def seeds():
         table = Table([[0.5, 1.0], [100.0, 3.0], [18.0, 99.0]], names=["mass", "distance", "magnitude"])
         table["distance"].unit = "pc"
         _SEEDS.update(besancon=BESANCON.encode(), csv=CSV.encode())
+        _SEEDS.update(trilegal=TRILEGAL.encode(), gaia=GAIA.encode())
+        stream = io.StringIO()
+        Table.read(GAIA, format="ascii.csv").write(stream, format="ascii.ecsv")
+        _SEEDS["gaia-ecsv"] = stream.getvalue().encode()
         for name in ("ecsv", "fits", "votable"):
             stream = io.StringIO() if name == "ecsv" else io.BytesIO()
             table.write(stream, format="ascii.ecsv" if name == "ecsv" else name)

@@ -195,7 +195,7 @@ WRONG = [  # arguments, what the one line says
     ([*GALAXY, "--mag", "18"], "--mag"),
     ([*GALAXY, "--area", "0.01", "--mag", "18", "19", "-o", "nowhere/s.ecsv"], "nowhere/s.ecsv"),
     (["stars", "--catalog", "{stars}", "--map", "mass"], "--map: must be column=name,column=name, got mass"),
-    (["stars", "--catalog", "{stars}", "--format", "trileg"], "format: must be one of besancon, table"),
+    (["stars", "--catalog", "{stars}", "--format", "trileg"], "format: must be one of besancon, trilegal, gaia, table"),
     (["predict", "--stars", "{stars}", "--mag", "18", "19", "--psf", "psf9"], "psf: must be one of psf0, psf1, psf2"),
     ([*PREDICT, "--binary-fraction", "1.2"], "--binary-fraction: must be in [0, 1], got 1.2"),
     ([*PREDICT, "--n-stars", "0"], "--n-stars: must be at least 1, got 0"),
@@ -203,6 +203,13 @@ WRONG = [  # arguments, what the one line says
     ([*PREDICT, "--multiplicity", "dk12"], "dk13-kcm16 (did you mean dk13"),
     ([*PREDICT, "--multiplicity", "{{gap_rule: upper}}"], "gap_rule: must be 'lower' or 'solar', got upper"),
     ([*PREDICT, "--multiplicity", "{{gap"], "--multiplicity: must be a name or {model: name, option: value}"),
+    ([*PREDICT, "--cut", "0.5"], "--cut: is too wide for the kernel moments of this PSF"),
+    ([*PREDICT, "--format", "table"], "--stars: cannot be given together with --format"),
+    ([*PREDICT, "--multiplicity", "{{gap_rule: null}}"], "multiplicity: gap_rule must be lower or solar, got None"),
+    (["paper", "-o", "out", "--seed", "-1"], "seed: must be greater than or equal to 0, got -1"),
+    (["bench", "--seed", "-1"], "seed: must be greater than or equal to 0, got -1"),
+    ([*GALAXY, "--mag", "0", "inf"], "mag must be [lo, hi) with lo < hi, within -50 to 50"),
+    (["simulate", "{config}", "-o", "x" * 300], "output: cannot be written (File name too long)"),
     ([*PREDICT, "--band", "J"], "band must be one of"),
     ([*GALAXY, "--band", "J"], "band must be one of"),
     (["predict", "--stars", "{stars}", "--psf", "psf1"], "--mag"),
@@ -253,7 +260,7 @@ def test_wrong_input_gives_one_line_and_writes_nothing(
     assert out == ""
     assert len(lines) == 1
     assert message in lines[0]
-    assert "Traceback" not in err
+    assert err.count("\n") == 1
     assert sorted(tmp_path.iterdir()) == before
 
 

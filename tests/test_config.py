@@ -1,3 +1,4 @@
+import json
 import re
 
 import pytest
@@ -47,6 +48,16 @@ def test_models_by_name_and_with_options():
         ({"n_stars": 0}, "n_stars: must be greater than or equal to 1, got 0"),
         ({"n_stacks": 1.5}, "n_stacks: must be a valid integer"),
         ({"cut": -0.05}, "cut: must be greater than 0, got -0.05"),
+        ({"n_stars": True}, "n_stars: must be a valid integer, got True"),
+        ({"n_stars": 10**24}, "n_stars: must be less than or equal to 1000000000"),
+        (
+            {"multiplicity": {"a_max_factor": float("inf")}},
+            "multiplicity.a_max_factor: must be a finite number",
+        ),
+        (
+            {"stars": {"l": 180, "b": 45, "mag": [18, float("inf")]}},
+            "stars: mag must be [lo, hi) with lo < hi, within",
+        ),
         ({"seed": -3}, "seed: must be greater than or equal to 0, got -3"),
         ({"psf": []}, "psf: "),
         ({"psf": ["psf0", "psf0"]}, "psf: must name each PSF once, got psf0, psf0"),
@@ -66,7 +77,7 @@ def test_models_by_name_and_with_options():
         ),
         (
             {"stars": {"l": 180, "b": 45, "mag": [19, 18]}},
-            "stars: mag must be [lo, hi) with lo < hi, got [19.0, 18.0]",
+            "stars: mag must be [lo, hi) with lo < hi, within -50 to 50, got [19.0, 18.0]",
         ),
         ({"stars": {"l": 180, "b": 45, "magn": [18, 19]}}, "stars.magn: is not a key (did you mean mag?)"),
         (
@@ -109,6 +120,7 @@ def test_a_file_s_catalogue_is_relative_to_the_file(tmp_path):
     ("content", "message"),
     [
         (b"stars: {l: 180\n", "run.yaml, row 2: is not YAML"),
+        (b"seed: 1\nseed: 2\n", "run.yaml, row 2: is not YAML (key seed stands twice)"),
         (b"- 1\n- 2\n", "run.yaml: must hold keys and values, got list"),
         (b"", "run.yaml: must hold keys and values, got NoneType"),
         (b"\xff\xfe\x00", "run.yaml: must be a UTF-8 text file"),
@@ -125,6 +137,37 @@ def test_files_that_are_no_configuration(tmp_path, content, message):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"absent.yaml: cannot be read \(No such file or directory\)"):
         load(tmp_path / "absent.yaml")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"multiplicity": {"model": "dk13-kcm16", "a_max_factor": None}},
+        {
+            "multiplicity": {"gap_rule": "solar"},
+            "photometry": {"model": "habets-heintze", "branch": "primary"},
+        },
+        {"multiplicity": "dk13-kcm16"},
+        {},
+    ],
+)
+def test_what_is_written_is_what_is_read(changes):
+    config = parse(RunConfig, example(**changes))
+    back = parse(RunConfig, json.loads(canonical(config)))
+    assert back.multiplicity.build() == config.multiplicity.build()
+    assert back.photometry.build() == config.photometry.build()
+    assert canonical(back) == canonical(config)
+
+
+def test_a_null_option_is_not_the_model_s_own():
+    full = parse(RunConfig, example(multiplicity={"model": "dk13-kcm16", "a_max_factor": None}))
+    assert canonical(full) != canonical(parse(RunConfig, example(multiplicity="dk13-kcm16")))
+
+
+@pytest.mark.parametrize("options", [{"gap_rule": None}, {"scatter_scale": None}, {"projection": None}])
+def test_options_that_may_not_be_null_are_refused(options):
+    with pytest.raises(InputError, match="multiplicity: "):
+        parse(RunConfig, example(multiplicity=options)).multiplicity.build()
 
 
 def test_equal_configurations_are_written_alike():

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from porrima import figures
 from porrima.dust import WAVELENGTHS, Place, extinction_ratio
+from porrima.experiments import galaxy_against_catalog, population
 from porrima.galaxy import Robin2003
 from porrima.photometry import MainSequence, magnitudes
 from porrima.populations import COMPONENTS, LOG_MASS, main_sequence_end
@@ -51,7 +53,7 @@ def test_nearby_stars_are_the_local_density_times_the_volume():
     counts = near.star_counts(30.0, 20.0, np.array([-10.0, 40.0]))
     volume = 20.0**3 / 3.0 * (np.pi / 180.0) ** 2
     halo = COMPONENTS[8]
-    end = main_sequence_end(np.full(1, halo.metallicity), np.full(1, np.log10(14e9)))
+    end = main_sequence_end(np.full(1, halo.metallicity), np.full(1, np.log10(13e9)))
     number = halo.number_density()[10 ** LOG_MASS[1:] < end].sum()
     np.testing.assert_allclose(counts.by_component[8, 0], number * volume, rtol=0.03)  # ends vary with [M/H]
 
@@ -107,12 +109,36 @@ def test_every_band_has_its_extinction_and_the_law_is_one_at_v():
     assert np.all(np.diff([extinction_ratio(band) for band in by_wavelength]) < 0)
 
 
+@pytest.mark.parametrize(
+    ("wavelength", "published"),
+    [(0.70, 0.751), (0.90, 0.479), (1.25, 0.282), (1.6, 0.190), (2.2, 0.114)],
+    ids=["R", "I", "J", "H", "K"],
+)
+def test_extinction_law_is_the_published_table(wavelength, published, monkeypatch):
+    """Cardelli, Clayton & Mathis (1989), Table 3."""
+    monkeypatch.setitem(WAVELENGTHS, "test", wavelength)
+    assert abs(extinction_ratio("test") - published) < 0.002
+
+
+@pytest.mark.parametrize(
+    ("band", "documented"),
+    [
+        ("g", 1.19), ("r", 0.87), ("i", 0.65), ("z", 0.47), ("gaia_G", 0.87), ("euclid_VIS", 0.73),
+        ("roman_F106", 0.37), ("roman_F129", 0.27), ("roman_F158", 0.19), ("roman_F184", 0.15),
+    ],
+)  # fmt: skip
+def test_extinction_of_each_band_is_the_documented_one(band, documented):
+    model, far = Robin2003(), np.array([5000.0])
+    ratio = model.extinction(30.0, 10.0, far, band)[0] / model.extinction(30.0, 10.0, far)[0]
+    assert abs(ratio - documented) < 0.008
+
+
 def test_dust_hides_stars():
     with_dust, without = (Robin2003(extinction_per_kpc=k).counts(30.0, 3.0, EDGES) for k in (0.7, 0.0))
     assert np.all(with_dust < without)
 
 
-@pytest.mark.parametrize("band", ["g", "euclid_VIS", "gaia_G", "roman_F158"])
+@pytest.mark.parametrize("band", MainSequence().bands)
 def test_drawn_counts_agree_in_other_bands(band):
     area = 4.0
     n = len(Robin2003().draw(180.0, 45.0, area, band, (18.0, 20.0), generator()))
@@ -254,3 +280,70 @@ def test_bad_input_is_named(change, message):
 def test_bad_models_and_places_are_named(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("component", COMPONENTS, ids=lambda c: c.name)
+def test_the_mass_function_has_the_stated_slopes_and_no_step(component):
+    width = np.diff(10**LOG_MASS)
+    mass = 10 ** (0.5 * (LOG_MASS[1:] + LOG_MASS[:-1]))
+    log_density = np.log(component.number_density() / width)
+    slope = -np.diff(log_density) / np.diff(np.log(mass))
+    expected = component.slopes(mass)
+    same = expected[1:] == expected[:-1]
+    np.testing.assert_allclose(slope[same], expected[1:][same], atol=0.01)  # means over cells
+    between = (np.minimum(expected[1:], expected[:-1]) - 0.01 <= slope) & (
+        slope <= np.maximum(expected[1:], expected[:-1]) + 0.01
+    )
+    assert np.all(between)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return population((16.0, 24.0))
+
+
+def test_shares_of_mass_classes_add_up(sky):
+    share = sky["share"].dropna("angle", how="all")
+    parts = share.sel(mass_class=["0.5-0.7", "0.7-1.5"]).sum("mass_class", skipna=False)
+    np.testing.assert_allclose(parts, share.sel(mass_class="0.5-1.5"), rtol=1e-12)
+    whole = share.sel(mass_class=["below 0.1", "0.1-0.5", "0.5-1.5"]).sum("mass_class", skipna=False)
+    np.testing.assert_allclose(whole.to_numpy()[np.isfinite(whole)], 1.0, rtol=1e-12)
+
+
+def test_binary_fractions_follow_from_the_shares(sky):
+    """The model's rows: 0.22, 0.26, 0.44, with the gap from 0.5 to 0.7 M_sun on either side."""
+    share = {str(name): sky["share"].sel(mass_class=name) for name in sky["mass_class"].to_numpy()}
+    low = 0.22 * share["below 0.1"] + 0.26 * share["0.1-0.5"]
+    np.testing.assert_allclose(
+        sky["binary_fraction"].sel(gap_rule="solar"), low + 0.44 * share["0.5-1.5"], rtol=1e-9
+    )
+
+
+def test_scans_of_the_sky_meet_where_they_cross(sky):
+    crossing = sky["share"].sel(scan="l = 180", angle=45.0)
+    np.testing.assert_allclose(sky["share"].sel(scan="b = 45", angle=180.0), crossing, rtol=1e-12)
+
+
+def test_stars_above_the_photometry_are_next_to_none_at_these_magnitudes(sky):
+    limit = sky["bright_limit"].to_numpy()
+    assert np.all(limit[np.isfinite(limit)] >= 0)
+    assert np.nanmax(limit) < 1e-3
+
+
+def test_population_figure_has_named_axes_and_all_scans(sky):
+    axes = figures.population(sky).axes
+    assert len(axes) == 6
+    assert axes[0].get_ylabel() == "share of the stars"
+    assert axes[3].get_ylabel() == "mean binary fraction"
+    assert [axis.get_xlabel().split(" [")[1] for axis in axes[3:]] == ["deg]"] * 3
+    assert all(len(axis.lines) == 5 for axis in axes[:3])
+
+
+def test_stars_of_the_model_agree_with_itself_as_a_catalogue():
+    stars = Robin2003().draw(200.0, 59.0, 4.0, "i", (16.0, 23.0), generator())
+    data = galaxy_against_catalog(stars, Robin2003(), (200.0, 59.0), EDGES, generator())
+    assert_within_sigma(data["galaxy"].to_numpy(), data["catalog"].to_numpy(), data["stderr"].to_numpy())
+    axes = figures.galaxy_against_catalog([data, data]).axes
+    assert len(axes) == 8
+    assert axes[0].get_ylabel() == "stars per deg² and mag"
+    assert axes[-1].get_xlabel() == "$i$ [mag]"

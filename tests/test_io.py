@@ -37,7 +37,7 @@ def test_units_of_a_table_are_honoured(tmp_path):
             "flux_ratio,dx,dy\n0.5,0,0\n1.5,0,0\n",
             r"pairs.csv, row 3, column flux_ratio: must be in \[0, 1\], got 1.5",
         ),
-        ("flux_ratio,dx,dy\n0.5,nan,0\n", "pairs.csv, row 2, column dx: must be finite, got nan"),
+        ("flux_ratio,dx,dy\n0.5,nan,0\n", "pairs.csv, row 2, column dx: must be within 10 arcsec, got nan"),
         (
             "flux_ratio,dx,dy,weight\n0.5,0,0,-1\n",
             "row 2, column weight: must be finite and not negative, got -1",

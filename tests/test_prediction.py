@@ -229,6 +229,15 @@ def test_stars_integrated_in_parts_are_the_same(population, monkeypatch):
         )
 
 
+def test_a_cut_beyond_the_series_gives_no_number(stars):
+    models = {"multiplicity": DucheneKraus2013(), "photometry": PHOTOMETRY["main-sequence"]}
+    wide = Population.of(stars, cut=0.3, **models)
+    moments = population_moments(wide, integrate(wide), np.array([0.35]))
+    adaptive = response(psf_from_name("psf1"), estimator_from_name("adaptive"))
+    assert np.all(np.isnan(predict(moments, adaptive, 40).bias))
+    assert np.all(np.isfinite(predict(moments, plain(), 40).sd))
+
+
 def test_a_stack_needs_a_star(population):
     moments = population_moments(population, integrate(population), np.array([0.35]))
     with pytest.raises(ValueError, match="n_stars must be at least 1, got 0"):

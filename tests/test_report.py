@@ -53,6 +53,7 @@ def test_each_panel_shows_its_symbols_and_lines(numbers):
         axes, [(q, s) for q in ("r2", "e1", "e2") for s in ("sigma", "bias")], strict=True
     ):
         assert axis.get_ylabel()
+        assert len(axis.containers) == 3
         for p, bars in enumerate(axis.containers):
             here = {"psf": numbers.summary["psf"].to_numpy()[p], "quantity": quantity}
             np.testing.assert_allclose(

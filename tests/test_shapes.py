@@ -137,10 +137,11 @@ def test_estimators_are_found_by_name(name):
 @pytest.mark.parametrize(
     ("name", "rule"),
     [
-        ("moments", "estimator: must be one of adaptive, plain, gaussian:S, got moments"),
-        ("gaussian", "estimator: must be one of adaptive, plain, gaussian:S, got gaussian"),
+        ("moments", "estimator: must be one of adaptive, plain, plain:R, gaussian:S, got moments"),
+        ("gaussian", "estimator: must be one of adaptive, plain, plain:R, gaussian:S, got gaussian"),
         ("gaussian:wide", "S of gaussian:S must be a number of arcsec, at least 0.02, got gaussian:wide"),
         ("gaussian:-1", "at least 0.02, got gaussian:-1"),
+        ("plain:0", "R of plain:R must be a number of arcsec, at least 0.1, got plain:0"),
         ("gaussian:nan", "at least 0.02, got gaussian:nan"),
     ],
 )

@@ -9,7 +9,8 @@ from porrima import simulation
 from porrima.config import RunConfig, parse
 from porrima.errors import InputError
 from porrima.moments import INDICES
-from porrima.simulation import draw_stars, open_run, simulate
+from porrima.sample import draw_stars
+from porrima.simulation import open_run, simulate
 
 
 def small(**changes):

@@ -1,12 +1,16 @@
+from dataclasses import replace
+
 import numba
 import numpy as np
 import pytest
 
+from porrima.errors import InputError
 from porrima.moments import INDICES
 from porrima.multiplicity import DucheneKraus2013
 from porrima.photometry import PHOTOMETRY, HabetsHeintze1981, flux_ratio
-from porrima.prediction import integrate
+from porrima.prediction import integrate, population_moments
 from porrima.stack import draw_stacks, draw_systems
+from porrima.stars import Stars
 from porrima.systems import Population
 from statistics_helpers import assert_within_sigma
 
@@ -36,6 +40,13 @@ def test_large_stack_numbers_and_seeds_have_streams_of_their_own(population):
     near = draw_stacks(population, first=0, last=50, **RUN)
     big_seed = draw_stacks(population, first=0, last=50, **(RUN | {"seed": RUN["seed"] + 2**32}))
     assert len({*near.binary_fraction, *far.binary_fraction, *big_seed.binary_fraction}) == 150
+    fixed = RUN | {"binary_fraction": 0.9}  # so that it is the streams of the pairs that differ
+    one = draw_stacks(population, first=0, last=50, **fixed).moments.values[:, XX]
+    two = draw_stacks(population, first=2**32, last=2**32 + 50, **fixed).moments.values[:, XX]
+    other = draw_stacks(
+        population, first=0, last=50, **(fixed | {"seed": RUN["seed"] + 2**32})
+    ).moments.values[:, XX]
+    assert len({*one, *two, *other}) == 150
 
 
 def test_listed_systems_have_the_moments_of_their_stack(population):
@@ -148,6 +159,35 @@ def test_stars_weighted_by_flux_are_what_plain_numpy_draws(stars, fraction):
     kept = 1 - p * (1 - integrate(population).unresolved)
     expected = np.average(population.weight, weights=kept)
     assert_within_sigma(weights.mean(), expected, weights.std() / np.sqrt(weights.size))
+
+
+def test_where_all_pairs_are_resolved_no_stack_can_be_drawn():
+    near = Stars.from_columns(mass=[0.09], distance=[5.0], magnitude=[18.0])
+    models = {"multiplicity": DucheneKraus2013(), "photometry": PHOTOMETRY["main-sequence"]}
+    population = Population.of(near, cut=1e-6, **models)
+    with pytest.raises(
+        ValueError, match="cut must leave some pairs unresolved at this binary fraction, got 1e-06"
+    ):
+        draw_stacks(population, n_stars=3, binary_fraction=1.0, seed=1, first=0, last=2)
+    with pytest.raises(InputError, match="cut: must leave some pairs unresolved"):
+        population_moments(population, integrate(population), np.array([1.0]))
+
+
+def test_any_law_of_multiplicity_can_be_drawn_from(stars):
+    """A fraction of its own for each star, some of them none, and a flat law of log mass ratios."""
+    population = Population.of(stars, multiplicity=DucheneKraus2013(), photometry=PHOTOMETRY["main-sequence"])
+    rng = np.random.Generator(np.random.Philox(12))
+    fraction = np.where(rng.random(len(stars)) < 0.1, 0.0, rng.random(len(stars)))
+    law = replace(
+        population.law, multiplicity_fraction=fraction, mass_ratio_exponent=np.full(len(stars), -1.0)
+    )
+    population = replace(population, law=law)
+    for wanted in (0.3, 0.85):
+        moments = population_moments(population, integrate(population), np.array([wanted]))
+        drawn = draw_stacks(
+            population, n_stars=400, binary_fraction=wanted, seed=2, first=0, last=5000
+        ).moments.values
+        assert_within_sigma(drawn.mean(axis=0), moments.mean[0], drawn.std(axis=0) / np.sqrt(5000))
 
 
 @pytest.mark.parametrize(

@@ -58,3 +58,10 @@ def test_an_empty_bin_has_no_mean():
     assert counts[0]["n"] == 0
     assert counts[0]["mean_mass"] is None
     assert counts[0]["n_per_deg2"] is None
+
+
+@pytest.mark.parametrize("low", np.arange(14.0, 16.0, 0.1))
+def test_no_bin_is_empty_of_width(low):
+    edges = [(c["mag_lo"], c["mag_hi"]) for c in three().counts((low, low + 2.0), np.zeros(3))]
+    assert len(edges) == 2
+    assert all(hi - lo > 0.5 for lo, hi in edges)

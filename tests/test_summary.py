@@ -67,7 +67,7 @@ def test_the_number_of_bins_does_not_move_the_truth(run):
 
 def test_rows_have_the_keys_of_the_contract(run):
     first = rows(summarise(*run, bins=4))[0]
-    assert list(first) == ["psf", "quantity", "f_lo", "f_hi", "n_stacks", *STATISTICS]
+    assert list(first) == ["psf", "quantity", "f_lo", "f_hi", "n_stacks", "n_failed", *STATISTICS]
     assert (first["psf"], first["quantity"], first["f_lo"], first["f_hi"]) == ("psf0", "r2", 0.0, 0.25)
 
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import galsim
 import numba
 
-from porrima.config import RunConfig, StarsConfig
+from porrima.config import RunConfig, parse
 from porrima.psf import psf_from_name
 from porrima.response import response
+from porrima.sample import draw_stars, population_of
 from porrima.shapes import estimator_from_name
-from porrima.simulation import draw_stars, population_of
 from porrima.stack import draw_stacks, draw_systems
 
 if TYPE_CHECKING:
@@ -72,7 +72,9 @@ def measure_speed(*, n_stars: int = 40, n_stacks: int = 100_000, seed: int = 1) 
     speed : Speed
         Stars per second and their ratio.
     """
-    config = RunConfig(stars=StarsConfig(l=180.0, b=45.0, mag=(18.0, 19.0)), binary_fraction=0.35, seed=seed)
+    config = parse(
+        RunConfig, {"stars": {"l": 180, "b": 45, "mag": [18, 19]}, "binary_fraction": 0.35, "seed": seed}
+    )
     population = population_of(config, draw_stars(config))
     run = {"n_stars": n_stars, "binary_fraction": 0.35, "seed": seed}
     reply = response(psf_from_name("psf1"), estimator_from_name("adaptive"))

@@ -8,19 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from porrima.errors import InputError
+from porrima.rows import SKY_AREA, CatalogRows, NoOptions, numbers, parsed_options, refuse
 from porrima.stars import COMPONENTS
-from porrima.tables import SKY_AREA, CatalogFile, CatalogRows, numbers, refuse
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from porrima.tables import CatalogFile
+
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
     BoolArray = NDArray[np.bool_]
 
-__all__ = ["COMPONENT_AGES", "SIGNATURE", "read_besancon", "sdss_i"]
+__all__ = ["COMPONENT_AGES", "SIGNATURE", "i_from_johnson", "read_besancon", "sdss_i"]
 
 COMPONENT_AGES = (0.075, 0.575, 1.5, 2.5, 4.0, 6.0, 8.5, 11.0, 14.0, 10.0)
 """Mean age in Gyr (10⁹ yr) of the components thin 1-7, thick disc, halo, bulge of Robin et al. (2003)."""
@@ -71,6 +73,28 @@ def sdss_i(v: FloatArray, v_minus_i: FloatArray) -> FloatArray:
     return i
 
 
+def i_from_johnson(v: FloatArray, v_minus_i: FloatArray) -> tuple[FloatArray, dict[str, BoolArray]]:
+    """SDSS i magnitude (AB) as `sdss_i` has it, and what was assumed for it.
+
+    Parameters
+    ----------
+    v, v_minus_i : (n,) float array
+        As for `sdss_i`, in mag.
+
+    Returns
+    -------
+    i : (n,) float array
+        In mag (AB).
+    assumed : dict of str to (n,) bool array
+        What was assumed, and of which stars (dimensionless).
+    """
+    outside = (v_minus_i < _V_MINUS_I[0]) | (v_minus_i > _V_MINUS_I[-1])
+    return sdss_i(v, v_minus_i), {
+        "i from V and V-I": np.ones(v.size, dtype=bool),
+        "V-I beyond the range of its colour term": outside,
+    }
+
+
 def _fields(line: str) -> list[str]:
     """Fields of a line, separated by commas, or else by white space."""
     return [part.strip().strip('"') for part in line.split(",")] if "," in line else line.split()
@@ -107,6 +131,7 @@ def read_besancon(file: CatalogFile) -> CatalogRows:
     if file.columns:
         rule = "must not be given for a Besançon file, whose header names the columns (or give format table)"
         raise InputError(rule, key="columns")
+    parsed_options(file.options, NoOptions)
     lines = file.lines()
     start = next((k for k, line in enumerate(lines) if set(_fields(line.lstrip("#"))) >= _HEADER), None)
     if start is None:
@@ -126,8 +151,20 @@ def read_besancon(file: CatalogFile) -> CatalogRows:
     if not row:
         raise InputError("must have rows below its header line", source=file.path, row=start + 1)
     columns = _columns(file.path, names, lines, row)
+    _check_distances(file.path, lines[:start], columns["Dist"], np.array(row) + 1)
     area = _solid_angle(file.path, [*lines[:start], *(lines[k] for k in frame)], len(row))
     return _rows(file, columns, np.array(row) + 1, area)
+
+
+def _check_distances(path: Path, header: list[str], distance: FloatArray, row: IntArray) -> None:
+    """Stop at a distance that no star of the model has: beyond the header's limit, or in another unit."""
+    limit = re.search(r"Distance\s+\d{1,9}\.?\d*\s+a\s+(\d{1,9}\.?\d*)\s+kpc", "\n".join(header))
+    if limit and float(limit[1]) > 0:
+        rule = f"must be in kpc and no more than the {limit[1]} of the header"
+        refuse(path, row, "Dist", distance, distance > 1.001 * float(limit[1]), rule)
+    else:
+        bad = (distance > 0) & ((distance < 0.001) | (distance > 2000))
+        refuse(path, row, "Dist", distance, bad, "must be from 0.001 to 2000 kpc (is it in kpc?)")
 
 
 def _solid_angle(path: Path, frame: list[str], n_rows: int) -> float | None:
@@ -226,12 +263,6 @@ def _magnitude(
     if band in known:
         return known[band], {}
     if band == "i" and {"V", "I"} <= set(known):
-        v_minus_i = known["V"] - known["I"]
-        outside = (v_minus_i < _V_MINUS_I[0]) | (v_minus_i > _V_MINUS_I[-1])
-        assumed = {
-            "i from V and V-I": np.ones(v_minus_i.size, dtype=bool),
-            "V-I beyond the range of its colour term": outside,
-        }
-        return sdss_i(known["V"], v_minus_i), assumed
+        return i_from_johnson(known["V"], known["V"] - known["I"])
     rule = f"must be one of {', '.join(sorted(known)) or 'none'}, which the file has"
     raise InputError(rule, source=path, key="band", value=band)

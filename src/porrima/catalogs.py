@@ -1,8 +1,7 @@
-"""Real catalogues to `Stars`: the output of the Besançon model, or any table with named columns."""
+"""Real catalogues to `Stars`: the output of two models of the Galaxy, Gaia, or any table with named columns."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +11,16 @@ import numpy as np
 from porrima.besancon import SIGNATURE as BESANCON
 from porrima.besancon import read_besancon
 from porrima.errors import InputError
+from porrima.gaia import SIGNATURE as GAIA
+from porrima.gaia import read_gaia
+from porrima.rows import CatalogRows, NoOptions, parsed_options, refuse, table_area
 from porrima.stars import COMPONENTS, Stars
-from porrima.tables import SKY_AREA, CatalogFile, CatalogRows, column_values, load_table, open_catalog, refuse
+from porrima.tables import CatalogFile, column_values, load_columns, open_catalog, write_table
+from porrima.trilegal import SIGNATURE as TRILEGAL
+from porrima.trilegal import read_trilegal
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
@@ -35,6 +40,9 @@ OPTIONAL = {"metallicity": "dex", "log_age": "dex(yr)", "component": "", "lumino
 _ASSUMED = {"metallicity": 0.0, "log_age": 9.7}  # the Sun's, as `Stars.from_columns` takes them
 _MAIN_SEQUENCE = 5  # luminosity class V
 _NO_MAGNITUDE = 50.0  # catalogues write 99, -99 or 99.999 where a star has none
+_LEAST_MASS = 0.08  # M_sun: below it no hydrogen burns, and the photometry has nothing
+_LARGEST_MASS = 500.0  # M_sun: no star is heavier, so the column is in another unit
+_NEAREST, _FARTHEST = 1.0, 2e6  # pc: inside the first is the Sun alone, beyond the second no single star seen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,20 +78,25 @@ def read_catalog(
     format: str | None = None,  # noqa: A002  (the word of the command line and of astropy)
     columns: Mapping[str, str] | None = None,
     band: str | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Catalog:
     """Main-sequence stars of a catalogue file, with the count of what was left out.
 
     Parameters
     ----------
     path : path
-        Text (UTF-8), FITS or VOTable; also compressed with gzip.
+        Text (UTF-8), FITS or VOTable, also compressed with gzip; Parquet where pyarrow is installed.
     format : str, optional
         A key of `READERS`; where not given, it is recognised from the content.
     columns : mapping of str to str, optional
         For ``table``: the file's column of ``mass``, ``distance``, ``magnitude`` and, where there is one,
         of ``metallicity``, ``log_age``, ``component``, ``luminosity_class``; each by default its own name.
+        For ``gaia``: the names in `porrima.gaia.QUANTITIES`.
     band : str, optional
         Band of the magnitudes wanted; by default the one that the file states, or else ``"i"`` (AB).
+    options : mapping of str to object, optional
+        For ``trilegal``: the fields of `porrima.trilegal.TrilegalOptions`; for ``gaia``: those of
+        `porrima.gaia.GaiaOptions`.
 
     Returns
     -------
@@ -98,12 +111,15 @@ def read_catalog(
     Notes
     -----
     A mass of 0 and a magnitude beyond ±50 (99 in most catalogues) or NaN mean that the file has none: the
-    row is rejected and counted.  A mass or distance that is missing, NaN, infinite or negative, and a
-    distance of 0, is an error in any row, on the main sequence or not.
+    row is rejected and counted, and so is one below 0.08 M_sun, where no hydrogen burns.  A mass or distance
+    that is missing, NaN, infinite or negative, and a distance of 0, is an error in any row, on the main
+    sequence or not.  So is one that tells of another unit: a mass above 500 M_sun, a distance below 1 pc or
+    beyond 2 Mpc.  Rows that a reader leaves out by its own rules are not checked.
+
+    Of a FITS file only the columns in use are held in memory.
     """
-    file = open_catalog(Path(path), columns or {}, band)
-    beginning = file.data[:65536]
-    name = format or next((name for name, sign in _SIGNATURES.items() if sign.search(beginning)), "table")
+    file = open_catalog(Path(path), columns or {}, band, options)
+    name = format or next((name for name, sign in _SIGNATURES.items() if sign.search(file.head)), "table")
     if name not in READERS:
         raise InputError(f"must be one of {', '.join(READERS)}", key="format", value=name)
     with np.errstate(all="ignore"):  # the file's numbers may overflow or be NaN before they are checked
@@ -138,32 +154,28 @@ def write_stars(stars: Stars, path: str | os.PathLike[str]) -> None:
         if name != "luminosity_class":  # all are on the main sequence
             table[name] = getattr(stars, name)
             table[name].unit = unit or None
-    path = Path(path)
-    try:
-        partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        try:
-            with partial.open("x", encoding="utf-8") as stream:
-                table.write(stream, format="ascii.ecsv")
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError("must be writable", source=path, value=error.strerror) from None
-    except ValueError:  # no name at all, or a NUL in it
-        raise InputError("must be the name of a file", source=repr(str(path))) from None
+    write_table(table, Path(path))
 
 
 def _check(path: Path, rows: CatalogRows) -> None:
     """Stop at the first row whose mass or distance is none, or whose metallicity or age is infinite."""
     mass, distance = rows.values["mass"], rows.values["distance"]
-    bad = {
-        "mass": (~(np.isfinite(mass) & (mass >= 0)), "must be positive and finite (0 where unknown)"),
-        "distance": (~(np.isfinite(distance) & (distance > 0)), "must be positive and finite"),
-        **{quantity: (np.isinf(rows.values[quantity]), "must be finite") for quantity in _ASSUMED},
-    }
-    for quantity, (mask, rule) in bad.items():
-        if np.any(mask):
-            refuse(path, rows.row, rows.names[quantity], rows.values[quantity], mask, rule)
+    looked_at = np.ones(rows.row.size, dtype=bool)
+    for out in rows.rejected.values():
+        looked_at &= ~out
+    bad = [
+        ("mass", ~(np.isfinite(mass) & (mass >= 0)), "must be positive and finite (0 where unknown)"),
+        ("mass", mass > _LARGEST_MASS, f"must be no more than {_LARGEST_MASS:g} M_sun (is it in M_sun?)"),
+        ("distance", ~(np.isfinite(distance) & (distance > 0)), "must be positive and finite"),
+        (
+            "distance",
+            (distance < _NEAREST) | (distance > _FARTHEST),
+            f"must be from {_NEAREST:g} to {_FARTHEST:.0e} pc (is it in pc?)",
+        ),
+        *((quantity, np.isinf(rows.values[quantity]), "must be finite") for quantity in _ASSUMED),
+    ]
+    for quantity, mask, rule in bad:
+        refuse(path, rows.row, rows.names[quantity], rows.values[quantity], mask & looked_at, rule)
 
 
 def _select(path: Path, name: str, rows: CatalogRows) -> Catalog:
@@ -171,8 +183,10 @@ def _select(path: Path, name: str, rows: CatalogRows) -> Catalog:
     _check(path, rows)
     n = rows.row.size
     reasons = {
+        **rows.rejected,
         "not on the main sequence": rows.values.get("luminosity_class", np.full(n, 5.0)) != _MAIN_SEQUENCE,
         "no mass": rows.values["mass"] == 0,
+        f"below {_LEAST_MASS} M_sun": rows.values["mass"] < _LEAST_MASS,
         "no magnitude": ~(np.abs(rows.values["magnitude"]) < _NO_MAGNITUDE),
     }
     keep = np.ones(n, dtype=bool)
@@ -233,11 +247,13 @@ def _read_table(file: CatalogFile) -> CatalogRows:
     unknown = next((name for name in file.columns if name not in wanted), None)
     if unknown is not None:
         raise InputError(f"must be one of {', '.join(wanted)}", key="columns", value=unknown)
-    table, row = load_table(file)
+    parsed_options(file.options, NoOptions)
     names = {quantity: file.columns.get(quantity, quantity) for quantity in wanted}
+    loaded = load_columns(file, names.values())
+    table, row = loaded.table, loaded.row
     for quantity, name in names.items():
-        if name not in table.colnames and (quantity in REQUIRED or quantity in file.columns):
-            rule = f"must be in the table, for {quantity}; it has {', '.join(table.colnames[:30])}"
+        if name not in loaded.names and (quantity in REQUIRED or quantity in file.columns):
+            rule = f"must be in the table, for {quantity}; it has {', '.join(loaded.names[:30])}"
             raise InputError(rule, source=file.path, column=name)
     if not len(table):
         raise InputError("must have rows below its header", source=file.path)
@@ -267,15 +283,7 @@ def _metadata(file: CatalogFile, meta: Mapping[Any, Any]) -> dict[str, Any]:
     band = str(own.get("band") or file.band or "i")
     if file.band and band != file.band:
         raise InputError(f"must be {band}, the file's own", source=file.path, key="band", value=file.band)
-    area = own.get("area_deg2")
-    if area is not None and not (isinstance(area, (int, float)) and 0 < area <= SKY_AREA):
-        rule = "must be positive and no more than the sky"
-        raise InputError(rule, source=file.path, key="area_deg2", value=repr(area))
-    return {
-        "band": band,
-        "area": None if area is None else float(area),
-        "source": str(own.get("source") or ""),
-    }
+    return {"band": band, "area": table_area(file.path, meta), "source": str(own.get("source") or "")}
 
 
 def _components(path: Path, column: Any, name: str, row: IntArray) -> NDArray[np.str_]:
@@ -298,8 +306,14 @@ def _components(path: Path, column: Any, name: str, row: IntArray) -> NDArray[np
 
 READERS: dict[str, Callable[[CatalogFile], CatalogRows]] = {
     "besancon": read_besancon,
+    "trilegal": read_trilegal,
+    "gaia": read_gaia,
     "table": _read_table,
 }
 """Format of a file: its reader."""
 
-_SIGNATURES = {"besancon": BESANCON}  # a file that shows none of these is a table
+_SIGNATURES = {
+    "besancon": BESANCON,
+    "trilegal": TRILEGAL,
+    "gaia": GAIA,
+}  # a file that shows none of these is a table

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,6 +16,8 @@ from porrima.errors import InputError
 from porrima.terminal import Progress, show
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from porrima.config import PopulationConfig
 
 __all__ = ["app", "main"]
@@ -38,6 +42,9 @@ Catalogue = Annotated[
 ]
 Format = Annotated[str | None, typer.Option("--format", help="Of the catalogue; recognised when not given.")]
 Mapping = Annotated[str | None, typer.Option("--map", help="Its columns: mass=M,distance=D,magnitude=I.")]
+ReaderOptions = Annotated[
+    str | None, typer.Option("--options", help="Of its format: binaries=drop, ruwe_max=1.4, ...")
+]
 Band = Annotated[str | None, typer.Option("--band", help="Of the magnitudes; i, or the catalogue's own.")]
 Mag = Annotated[tuple[float, float], typer.Option("--mag", help="Magnitude range [lo, hi).", metavar="LO HI")]
 MultiplicityName = Annotated[
@@ -64,6 +71,12 @@ def stars(
     catalog: Catalogue = None,
     format: Format = None,  # noqa: A002
     map: Mapping = None,  # noqa: A002
+    options: ReaderOptions = None,
+    gaia: Annotated[
+        bool, typer.Option("--gaia", help="Gaia DR3 around --l and --b, from its archive.")
+    ] = False,
+    radius: Annotated[float | None, typer.Option(help="Of the circle of --gaia [deg].")] = None,
+    save: Annotated[Path | None, typer.Option(help="ECSV file for the archive's own table.")] = None,
     band: Band = None,
     mag: Mag = (16.0, 24.0),
     multiplicity: MultiplicityName = "dk13",
@@ -71,25 +84,34 @@ def stars(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Stars of the analytic Galaxy, or of a real catalogue, selected and counted."""
+    """Stars of the analytic Galaxy, of a real catalogue or of Gaia's archive, selected and counted."""
     from porrima.catalogs import write_stars
-    from porrima.simulation import draw_stars
+    from porrima.sample import catalog_of, draw_stars
 
-    config = _population_config(
-        l=l, b=b, catalog=catalog, format=format, map=map, band=band, mag=mag, seed=seed,
-        multiplicity=multiplicity, area=area if catalog is None else None,
-    )  # fmt: skip
-    selected = draw_stars(config)
+    with _cone(gaia, l, b, radius, mag, save, catalog) as cone:
+        if cone is not None:
+            l, b, catalog, format = None, None, cone, "gaia"  # noqa: A001
+        config = _population_config(
+            l=l, b=b, catalog=catalog, format=format, map=map, options=options, band=band, mag=mag, seed=seed,
+            multiplicity=multiplicity, area=area if catalog is None else None,
+        )  # fmt: skip
+        read = catalog_of(config)
+    selected = draw_stars(config, read)
     law = config.multiplicity.build().companions(selected.mass)
     counts = selected.counts(mag, law.multiplicity_fraction)
     if output is not None:
         write_stars(selected, output)
-    result = {"n": len(selected), "area_deg2": selected.area, "counts": counts}
+    result: dict[str, Any] = {"n": len(selected), "area_deg2": selected.area, "counts": counts}
+    header = f"{len(selected)} stars, {selected.source}"
+    if read is not None:
+        result |= {"rejected": dict(read.rejected), "assumed": dict(read.assumed)}
+        for name in ("rejected", "assumed"):
+            header += "".join(f"\n{name}: {count} {reason}" for reason, count in result[name].items())
     table = [[f"{c['mag_lo']:g}-{c['mag_hi']:g}", *list(c.values())[2:]] for c in counts]
     show(
         result,
         as_json,
-        f"{len(selected)} stars, {selected.source}",
+        header,
         [
             selected.band,
             "stars",
@@ -116,11 +138,12 @@ def measure(
 ) -> None:
     """Shape of one stack of the pairs in a table, and its change against the PSF without companions."""
     from porrima.io import read_systems
+    from porrima.measurement import measured
     from porrima.psf import psf_from_name
     from porrima.shapes import estimator_from_name
 
     systems = read_systems(table)
-    result = _measured(table, systems, psf_from_name(psf), estimator_from_name(estimator), method)
+    result = measured(table, systems, psf_from_name(psf), estimator_from_name(estimator), method)
     header = f"{len(systems)} systems, {psf}, {estimator}, {method}"
     show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
 
@@ -132,6 +155,7 @@ def predict(
     catalog: Catalogue = None,
     format: Format = None,  # noqa: A002
     map: Mapping = None,  # noqa: A002
+    options: ReaderOptions = None,
     l: Longitude = None,
     b: Latitude = None,
     mag: Mag,
@@ -154,8 +178,9 @@ def predict(
     from porrima.response import response
     from porrima.shapes import estimator_from_name
 
-    if stars is not None and catalog is not None:
-        raise InputError("cannot be given together with --catalog", key="--stars", value=stars)
+    for key, value in (("--catalog", catalog), ("--format", format)):
+        if stars is not None and value is not None:
+            raise InputError(f"cannot be given together with {key}", key="--stars", value=stars)
     if stars is not None:
         catalog, format = stars, "table"  # noqa: A001
     if binary_fraction is not None and not 0 <= binary_fraction <= 1:
@@ -163,7 +188,7 @@ def predict(
     if n_stars is not None and n_stars < 1:
         raise InputError("must be at least 1", key="--n-stars", value=n_stars)
     config = _population_config(
-        l=l, b=b, catalog=catalog, format=format, map=map, band=band, mag=mag, seed=seed,
+        l=l, b=b, catalog=catalog, format=format, map=map, options=options, band=band, mag=mag, seed=seed,
         multiplicity=multiplicity, photometry=photometry, cut=cut, stack_weight=stack_weight,
     )  # fmt: skip
     reply = response(psf_from_name(psf), estimator_from_name(estimator))
@@ -239,6 +264,10 @@ def summary(
     result = rows(summarise(*open_run(run), bins=bins))
     if output is not None:
         write_rows(result, output)
+    failed = max((row["n_failed"] / row["n_stacks"] for row in result), default=0.0)
+    if failed > 0:
+        note = f"warning: up to {failed:.1%} of the stacks of a bin could not be measured and are left out, the widest"
+        print(f"{note} pairs first: the numbers are low; use --method images", file=sys.stderr)
     show({"bins": result}, as_json, str(run), _NUMBER_COLUMNS, _numbers(result))
 
 
@@ -289,6 +318,49 @@ def bench(
     show(result, as_json, "speed", ["quantity", "value"], [[k, v] for k, v in result.items()])
 
 
+@app.command()
+def response(
+    psf: Annotated[list[str], typer.Option(help="Name of a PSF; again for more. roman: 18 SCAs, 4 bands.")],
+    estimator: Annotated[
+        list[str] | None, typer.Option(help="adaptive, plain, plain:R, gaussian:S; again for more.")
+    ] = None,
+    pixel: Annotated[float | None, typer.Option(help="Side of a pixel to add [arcsec].")] = None,
+    pixel_scale: Annotated[float | None, typer.Option(help="Of a FITS image [arcsec].")] = None,
+    jitter: Annotated[float | None, typer.Option(help="Sigma of a Gaussian to add [arcsec].")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Folder: table and figure.")] = None,
+    as_json: Json = False,
+) -> None:
+    """What an estimator makes of companions behind a PSF: kappa, ellipticity, every derivative."""
+    from porrima.kappa import COLUMNS, expanded, responses, row, shown, write_responses
+
+    names, estimators = expanded(psf), estimator or ["adaptive"]
+    with Progress(len(names) * len(estimators), "responses") as progress:
+        found = responses(
+            names, estimators, progress.advance, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter
+        )
+    if output is not None:
+        write_responses(found, output)
+    rows = [row(one) for one in found]
+    show(shown(found), as_json, "responses", COLUMNS, [[r[name] for name in COLUMNS] for r in rows])
+
+
+@app.command()
+def toy(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the figure and its numbers.")],
+    psf_fwhm: Annotated[float, typer.Option(help="Of the Gaussian PSF [arcsec].")] = 0.137,
+    ellipticity: Annotated[float, typer.Option(help="Of the PSF, along e1 and along e2.")] = 0.05,
+    points: Annotated[int, typer.Option(help="Along a side of the pixel, odd.", min=3, max=401)] = 61,
+    as_json: Json = False,
+) -> None:
+    """Maps of the paper's toy model: one companion anywhere in the central pixel."""
+    from porrima.toy import write_toy
+
+    result = write_toy(output, fwhm=psf_fwhm, ellipticity=ellipticity, points=points)
+    table = [[key, value] for key, value in result.items() if key != "contrasts"]
+    table += [[f"{k}, delta_m {c['delta_m']:g}", v] for c in result["contrasts"] for k, v in c.items()]
+    show(result, as_json, f"figure: {result['figure']}", ["quantity", "value"], table)
+
+
 def main() -> None:
     """Run a command; wrong input ends in one line and exit code 2.
 
@@ -316,17 +388,46 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
+@contextlib.contextmanager
+def _cone(
+    gaia: bool,
+    l: float | None,
+    b: float | None,
+    radius: float | None,
+    mag: tuple[float, float],
+    save: Path | None,
+    catalog: Path | None,
+) -> Iterator[Path | None]:
+    """File of a circle of Gaia's archive, which goes when it need not be saved; None where not asked for."""
+    given = {"--catalog": catalog} if gaia else {"--radius": radius, "--save": save}
+    for key, value in given.items():
+        if value is not None:
+            rule = "cannot be given together with --gaia" if gaia else "needs --gaia"
+            raise InputError(rule, key=key, value=value)
+    if not gaia:
+        yield None
+        return
+    if l is None or b is None or radius is None:
+        raise InputError("needs --l, --b and --radius", key="--gaia")
+    from porrima.gaia import fetch_cone
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = save or Path(folder) / "gaia.ecsv"
+        fetch_cone(l, b, radius, mag, path)
+        yield path
+
+
 def _population_config(**options: Any) -> PopulationConfig:
     """Configuration from the options of a command, checked by the same rules as a file."""
     from porrima.config import PopulationConfig, parse
 
-    where = ("l", "b", "catalog", "format", "map", "band", "mag", "area")
-    columns = options.get("map")
-    if columns is not None:
-        parts = [part.split("=") for part in columns.split(",")]
-        if any(len(part) != 2 or not all(part) for part in parts):
-            raise InputError("must be column=name,column=name", key="--map", value=columns)
-        options["map"] = dict(parts)
+    where = ("l", "b", "catalog", "format", "map", "options", "band", "mag", "area")
+    for name, rule in (("map", "column=name,column=name"), ("options", "option=value,option=value")):
+        if options.get(name) is not None:
+            parts = [part.split("=") for part in options[name].split(",")]
+            if any(len(part) != 2 or not all(part) for part in parts):
+                raise InputError(f"must be {rule}", key=f"--{name}", value=options[name])
+            options[name] = dict(parts)
     for name in ("multiplicity", "photometry"):
         if str(options.get(name, "")).startswith("{"):
             options[name] = _model_with_options(name, options[name])
@@ -356,12 +457,15 @@ def _predicted(
 
     from porrima.prediction import QUANTITIES, integrate, population_moments
     from porrima.prediction import predict as predicted
-    from porrima.simulation import draw_stars, population_of
+    from porrima.sample import draw_stars, population_of
 
     population = population_of(config, draw_stars(config))
     fraction = None if binary_fraction is None else np.array([binary_fraction])
     moments = population_moments(population, integrate(population), fraction)
     prediction = predicted(moments, reply, n_stars)
+    if np.any(np.isnan(prediction.bias)):
+        rule = "is too wide for the kernel moments of this PSF: use --estimator plain, or simulate --method images"
+        raise InputError(rule, key="--cut", value=config.cut)
     errors = {
         f"{name}_{quantity}": value
         for name in ("bias", "sigma", "sd")
@@ -398,43 +502,3 @@ def _numbers(rows: list[dict[str, Any]]) -> list[list[Any]]:
         ]
         for row in rows
     ]
-
-
-def _measured(table: Path, systems: Any, psf: Any, estimator: Any, method: str) -> dict[str, float]:
-    """Shape of a stack and its change, as `measure` shows it."""
-    import numpy as np
-
-    from porrima.images import measure_stack
-    from porrima.response import response
-    from porrima.shapes import Failure
-    from porrima.systems import Systems
-
-    zero = np.zeros(1)
-    alone = Systems.from_pairs(zero, zero, zero)
-
-    def shape(of: Systems) -> Any:
-        if method == "images":
-            found = measure_stack(psf, of, estimator)
-        else:
-            found = response(psf, estimator).shapes(of.kernel_moments())
-        flag = Failure(int(np.squeeze(found.flag)))
-        if flag & Failure.SERIES:
-            raise InputError(
-                "has pairs too wide for this PSF's kernel moments: use --method images", key="TABLE"
-            )
-        if flag:
-            raise InputError(f"gives a stack that cannot be measured ({flag.name})", source=table)
-        return found
-
-    stack, single = (
-        {q: float(np.squeeze(getattr(shape(s), q))) for q in ("e1", "e2", "r2")} for s in (systems, alone)
-    )
-    return (
-        stack
-        | {f"{q}_0": v for q, v in single.items()}
-        | {
-            "de1": stack["e1"] - single["e1"],
-            "de2": stack["e2"] - single["e2"],
-            "dr2_rel": stack["r2"] / single["r2"] - 1,
-        }
-    )

@@ -42,13 +42,16 @@ class StarsConfig(_Strict):
 
     l: float | None = Field(default=None, ge=0, lt=360)
     b: float | None = Field(default=None, ge=-90, le=90)  # Galactic latitude, deg
-    n_drawn: int = Field(default=20_000, ge=1)  # stars drawn from the Galaxy in the magnitude range
+    n_drawn: int = Field(
+        default=20_000, ge=1, le=10**8, strict=True
+    )  # stars drawn from the Galaxy in the magnitude range
     area: float | None = Field(
         default=None, gt=0, le=41253
     )  # deg²: a Poisson number of stars fills it instead
     catalog: Path | None = None
     format: str | None = None
     map: dict[str, str] | None = None  # Porrima's column: the file's column
+    options: dict[str, str | float] | None = None  # of the catalogue's format
     band: str | None = None  # i, or the catalogue's own
     mag: tuple[float, float]
 
@@ -57,8 +60,8 @@ class StarsConfig(_Strict):
         direction = self.l is not None and self.b is not None
         if direction == (self.catalog is not None) or (self.l is None) != (self.b is None):
             raise ValueError("must have either a direction (l and b) or a catalogue")
-        if not self.mag[0] < self.mag[1]:
-            raise ValueError(f"mag must be [lo, hi) with lo < hi, got {list(self.mag)}")
+        if not -50 <= self.mag[0] < self.mag[1] <= 50:
+            raise ValueError(f"mag must be [lo, hi) with lo < hi, within -50 to 50, got {list(self.mag)}")
         return self
 
 
@@ -67,8 +70,8 @@ class Multiplicity(_Strict):
 
     model: str = "dk13"
     gap_rule: Literal["lower", "solar"] | None = None
-    a_max_factor: float | None = Field(default=None, gt=0)
-    scatter_scale: float | None = Field(default=None, gt=0)
+    a_max_factor: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    scatter_scale: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     projection: Literal["isotropic", "inclination-uniform"] | None = None
     mass_ratio_min: float | None = Field(default=None, gt=0, lt=1)
 
@@ -83,13 +86,16 @@ class Multiplicity(_Strict):
         Raises
         ------
         InputError
-            If no model has that name.
+            If no model has that name, or an option is wrong for it.
         """
         from porrima.multiplicity import MULTIPLICITY  # noqa: PLC0415  (compiled code, where used)
 
         named = known("multiplicity", self.model, MULTIPLICITY)
         options = self.model_dump(exclude={"model"}, exclude_unset=True)
-        return dataclasses.replace(named, **options)
+        try:
+            return dataclasses.replace(named, **options)
+        except (TypeError, ValueError) as error:
+            raise InputError(str(error), key="multiplicity") from None
 
 
 class Photometry(_Strict):
@@ -131,7 +137,7 @@ class PopulationConfig(_Strict):
     photometry: Photometry = Photometry()
     cut: float = Field(default=0.05, gt=0, allow_inf_nan=False)
     stack_weight: Literal["equal", "flux"] = "equal"
-    seed: int = Field(default=1, ge=0, lt=2**64)
+    seed: int = Field(default=1, ge=0, lt=2**64, strict=True)
 
     @field_validator("multiplicity", "photometry", mode="before")
     @classmethod
@@ -144,8 +150,8 @@ class RunConfig(PopulationConfig):
 
     psf: tuple[str, ...] = Field(default=("psf0", "psf1", "psf2"), min_length=1)
     estimator: str = "adaptive"
-    n_stars: int = Field(default=40, ge=1)
-    n_stacks: int = Field(default=100_000, ge=1)
+    n_stars: int = Field(default=40, ge=1, le=10**9, strict=True)
+    n_stacks: int = Field(default=100_000, ge=1, le=10**10, strict=True)
     binary_fraction: float | Literal["uniform", "model"] = "uniform"
 
     @field_validator("psf", mode="before")
@@ -169,6 +175,18 @@ class RunConfig(PopulationConfig):
         if not number or not 0 <= value <= 1:
             raise ValueError(f"must be in [0, 1], uniform or model, got {value}")
         return float(value)
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """YAML whose keys may stand only once."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for k, key in enumerate(keys):
+            if key in keys[:k]:
+                mark = node.value[k][0].start_mark
+                raise yaml.constructor.ConstructorError(None, None, f"key {key} stands twice", mark)
+        return super().construct_mapping(node, deep)
 
 
 def known(key: str, name: str, choices: Any) -> Any:
@@ -225,7 +243,7 @@ def load(path: Path) -> RunConfig:
     except UnicodeDecodeError:
         raise InputError("must be a UTF-8 text file", source=path) from None
     try:
-        data = yaml.safe_load(text)
+        data = yaml.load(text, _UniqueKeys)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         row = mark.line + 1 if mark else None
@@ -296,7 +314,12 @@ def canonical(config: BaseModel) -> str:
     text : str
         The same for equal configurations.
     """
-    return json.dumps(config.model_dump(mode="json", exclude_none=True), sort_keys=True)
+    data = config.model_dump(mode="json", exclude_none=True)
+    for name in ("multiplicity", "photometry"):  # where an option that is null says something
+        model = getattr(config, name, None)
+        if model is not None:
+            data[name] = {"model": model.model} | model.model_dump(mode="json", exclude_unset=True)
+    return json.dumps(data, sort_keys=True)
 
 
 def _keys(model: type[BaseModel], location: list[str]) -> list[str]:

@@ -131,7 +131,8 @@ def extinction_ratio(band: str) -> float:
     The mean law of Cardelli, Clayton & Mathis (1989, Eqs. 2 and 3), :math:`a(x) + b(x)/R_V` with x the
     inverse wavelength and :math:`R_V = 3.1`, at the band's effective wavelength.  It gives
     :math:`A_i/A_V = 0.65`, and 0.60 and 0.11 in I and K, where the Besançon model has 0.59 and 0.11.
-    Wide bands (Gaia G, Euclid VIS) lose less light of red stars than it says.
+    For g, r, i, z it is 1.19, 0.87, 0.65, 0.47; Gaia G 0.87, Euclid VIS 0.73; Roman F106, F129, F158, F184
+    0.37, 0.27, 0.19, 0.15.  Wide bands (Gaia G, Euclid VIS) lose less light of red stars than it says.
 
     References
     ----------

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["make_folder", "read_systems", "write_rows", "write_whole"]
 
 _PAIR_COLUMNS = {"flux_ratio": "", "dx": "arcsec", "dy": "arcsec"}
+_WIDEST = 10.0  # arcsec; what is wider is no unresolved pair for any survey
 
 
 def read_systems(path: Path) -> Systems:
@@ -54,8 +55,8 @@ def read_systems(path: Path) -> Systems:
     f, w = values["flux_ratio"], values["weight"]
     good = {
         "flux_ratio": ("must be in [0, 1]", (f >= 0) & (f <= 1)),
-        "dx": ("must be finite", np.isfinite(values["dx"])),
-        "dy": ("must be finite", np.isfinite(values["dy"])),
+        "dx": ("must be within 10 arcsec", np.abs(values["dx"]) <= _WIDEST),
+        "dy": ("must be within 10 arcsec", np.abs(values["dy"]) <= _WIDEST),
         "weight": ("must be finite and not negative", np.isfinite(w) & (w >= 0)),
     }
     for name, (rule, fine) in good.items():

@@ -14,9 +14,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr, logsumexp
 
+from porrima.errors import InputError
 from porrima.moments import INDICES, N_MOMENTS, ORDER, angular_mean, pair_coefficient
 from porrima.orbits import projection_nodes
 from porrima.photometry import flux_ratio
+from porrima.response import SERIES_LIMIT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,9 +35,11 @@ QUANTITIES = ("e1", "e2", "r2")
 
 _EVEN = tuple(range(2, ORDER + 1, 2))
 _PRODUCTS = tuple((n, m) for n in range(2, ORDER + 1) for m in range(n, ORDER + 1) if (n + m) % 2 == 0)
+_TAIL = np.array([a + b == ORDER for a, b in INDICES])
 _CHUNK = 4096  # stars integrated at a time
 _MASS_RATIO_PANELS = 48
 _DISTANCE_STEP = 0.004  # dex
+_LEAST_KEPT = 1e-6  # share of the stars that must be left once resolved pairs are gone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +112,7 @@ class Prediction:
         Size of the PSF without companions by the same estimator, in arcsec².
     bias : (3, k) float array
         Mean of e1, e2, r2 of the stack minus those of the PSF; r2 over that of the PSF.  Dimensionless.
+        Bias and sd are NaN where the pairs are too wide for a series in kernel moments, see `predict`.
     sd : (3, k) float array
         Standard deviation about the mean, dimensionless.
     """
@@ -250,6 +255,11 @@ def population_moments(
     moments : PopulationMoments
         For each fraction, in arcsec^(a+b).
 
+    Raises
+    ------
+    InputError
+        If nearly all stars are resolved pairs.
+
     Notes
     -----
     With :math:`p_i = \min(1, s\, MF_i)`,
@@ -273,6 +283,10 @@ def population_moments(
     sums = _weighted_sums(fraction[order], columns, scale)
     pairs, resolved_pairs = sums[:, 0], sums[:, 1]
     kept = fraction.size - resolved_pairs
+    if np.any(kept < _LEAST_KEPT * fraction.size):
+        raise InputError(
+            "must leave some pairs unresolved at this binary fraction", key="cut", value=population.cut
+        )
     mean_w, mean_w2 = (w.sum() - sums[:, 2]) / kept, ((w**2).sum() - sums[:, 3]) / kept
     first, x2, second, product = np.split(sums[:, 4:], np.cumsum([4, 1, 4]), axis=1)
     mean = _isotropic_means(first / (kept * mean_w)[:, None])
@@ -357,7 +371,9 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
 
     the first exact, the second to first order in x/R0² (6 % too large at N = 1, 0.9 % at 5), and for
     N → ∞ KCM16 Eqs. 7-12 with their second-order term.  For other estimators sd is first order about the
-    mean, with the same reservation at very small N.
+    mean, with the same reservation at very small N.  Where the moments of order 8 make up more than
+    `response.SERIES_LIMIT` of the mean size change, the series has not converged and the result is NaN:
+    a cut near the width of the PSF.  Plain moments have no such limit.
 
     References
     ----------
@@ -373,6 +389,9 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
     gradient = first[:, None, :] + bending
     variance = np.einsum("qki,kij,qkj->qk", gradient, c, gradient, optimize=True)
     r2_0 = float(response.shape0.r2)
+    size, tail = m @ first[2], m[:, _TAIL] @ first[2, _TAIL]
+    diverged = np.abs(tail) > SERIES_LIMIT * np.abs(size)
+    bias[:, diverged], variance[:, diverged] = np.nan, np.nan
     unit = np.array([1.0, 1.0, r2_0])[:, None]
     sd = np.sqrt(np.maximum(variance, 0.0))
     return Prediction(population=moments, n_stars=n_stars, r2_0=r2_0, bias=bias / unit, sd=sd / unit)

@@ -149,7 +149,9 @@ def _agreement(summary: xr.Dataset) -> str:
     }
     checked = int(np.isfinite(summary["bias"]).sum()) * len(pulls)
     worst = ", ".join(f"{name} {pull:.1f}" for name, pull in pulls.items())
-    return f"Largest difference of {checked} numbers, in standard errors of the simulation: {worst}."
+    failed = float((summary["n_failed"].sum("bin") / summary["n_stacks"].sum()).max())
+    lost = f" {failed:.1%} of the stacks could not be measured and are left out." if failed > 0 else ""
+    return f"Largest difference of {checked} numbers, in standard errors of the simulation: {worst}.{lost}"
 
 
 def _table(summary: xr.Dataset) -> str:

@@ -334,7 +334,7 @@ def drawn_stars(
     u = rng.random((4, size))
     near, far = sight.distance[i] ** 3, sight.distance[i + 1] ** 3
     distance = np.cbrt(near + u[0] * (far - near))
-    mass = _masses_in(cells.mass[cell], _SLOPE[component], u[1])
+    mass = _masses_in(cells.mass[cell], _SLOPE[component, cells.mass[cell]], u[1])
     deviate = ndtri((cells.stratum[cell] + u[2]) / N_STRATA)
     outward = Place.towards(sight.l, sight.b, distance).radius - R_SUN
     mh = _METALLICITY[component] + _SCATTER[component] * deviate + _GRADIENT[component] * outward
@@ -358,14 +358,14 @@ _NAME = np.array([c.name for c in COMPONENTS])
 _METALLICITY = np.array([c.metallicity for c in COMPONENTS])
 _SCATTER = np.array([c.scatter for c in COMPONENTS])
 _GRADIENT = np.array([c.gradient for c in COMPONENTS])
-_SLOPE = np.array([c.slope for c in COMPONENTS])
+_SLOPE = np.array([c.slopes(10 ** (0.5 * (LOG_MASS[1:] + LOG_MASS[:-1]))) for c in COMPONENTS])
 _YOUNGEST, _OLDEST = np.array([c.age for c in COMPONENTS]).T
 
 
 def _masses_in(cell: IntArray, slope: FloatArray, u: FloatArray) -> FloatArray:
     """Masses within their cells, after the IMF, at uniform deviates."""
     low, high = 10 ** LOG_MASS[cell], 10 ** LOG_MASS[cell + 1]
-    power = 1.0 - np.where(low > 1.0 - 1e-9, 3.0, slope)
+    power = 1.0 - slope
     mass = (low**power + u * (high**power - low**power)) ** (1.0 / power)
     within: FloatArray = np.clip(mass, *MainSequence().mass_range)
     return within

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import shutil
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import islice
@@ -18,15 +18,15 @@ import xarray as xr
 import zarr
 
 from porrima import __version__
-from porrima.config import PopulationConfig, RunConfig, canonical, parse
+from porrima.config import RunConfig, canonical, parse
 from porrima.errors import InputError
 from porrima.moments import INDICES, N_MOMENTS, KernelMoments
 from porrima.psf import psf_from_name
 from porrima.response import response
+from porrima.sample import draw_stars, population_of
 from porrima.shapes import estimator_from_name
 from porrima.stack import draw_stacks, draw_systems
 from porrima.stars import Stars
-from porrima.systems import BRIGHT_MASS, Population
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -35,10 +35,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from porrima.shapes import Shape
+    from porrima.systems import Population
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["Method", "draw_stars", "open_run", "population_of", "simulate"]
+__all__ = ["Method", "open_run", "simulate"]
 
 Method = Literal["moments", "images"]
 
@@ -46,7 +47,6 @@ CHUNK = 10_000
 """Stacks in a chunk: what an interruption can lose."""
 
 _STAR_COLUMNS = ("mass", "distance", "magnitude", "metallicity", "log_age")
-_GALAXY_STREAM = 1  # spawn key of the stars' generator; the engine's streams are keyed by the seed alone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,78 +58,6 @@ class _Chunk:
     binary_fraction: FloatArray
     shapes: FloatArray  # (3, n_psf, n): e1, e2, r2
     moments: FloatArray
-
-
-def draw_stars(config: PopulationConfig) -> Stars:
-    """Stars of a configuration: read or drawn, selected by magnitude and mass.
-
-    Parameters
-    ----------
-    config : PopulationConfig
-        With a direction or a catalogue.
-
-    Returns
-    -------
-    stars : Stars
-        Main-sequence stars up to 1.5 M_sun in the magnitude range.
-
-    Raises
-    ------
-    InputError
-        If the catalogue is wrong or no star is left.
-    """
-    where = config.stars
-    if where.l is not None and where.b is not None:
-        from porrima.galaxy import Robin2003  # noqa: PLC0415  (the Galaxy's tables, where used)
-
-        sequence = np.random.SeedSequence(config.seed, spawn_key=(_GALAXY_STREAM,))
-        rng = np.random.Generator(np.random.Philox(sequence))
-        n = None if where.area else where.n_drawn
-        try:
-            stars = Robin2003().draw(
-                where.l, where.b, where.area or 1.0, where.band or "i", where.mag, rng, n=n
-            )
-        except ValueError as error:
-            raise InputError(str(error), key="stars") from None
-    elif where.catalog is not None:
-        from porrima.catalogs import read_catalog  # noqa: PLC0415  (astropy's readers, where used)
-
-        stars = read_catalog(where.catalog, format=where.format, columns=where.map, band=where.band).stars
-    else:
-        raise InputError("must have either a direction (l and b) or a catalogue", key="stars")
-    selected = stars.select(magnitude=config.stars.mag, mass_max=BRIGHT_MASS)
-    if len(selected) == 0:
-        low, high = config.stars.mag
-        raise InputError(
-            f"no main-sequence star up to {BRIGHT_MASS} M_sun with magnitude in [{low}, {high})",
-            source=config.stars.catalog,
-            key="mag",
-        )
-    return selected
-
-
-def population_of(config: PopulationConfig, stars: Stars) -> Population:
-    """Population of a configuration.
-
-    Parameters
-    ----------
-    config : PopulationConfig
-        Models and cut.
-    stars : Stars
-        Already selected.
-
-    Returns
-    -------
-    population : Population
-        What simulation and prediction start from.
-    """
-    return Population.of(
-        stars,
-        multiplicity=config.multiplicity.build(),
-        photometry=config.photometry.build(),
-        cut=config.cut,
-        stack_weight=config.stack_weight,
-    )
 
 
 def simulate(
@@ -176,16 +104,15 @@ def simulate(
     """
     _check_output(path, resume)
     run = _Run(config=config, population=population_of(config, draw_stars(config)), method=method)
-    store = _open_or_create(run, path, resume, chunk)
-    chunk = store["binary_fraction"].chunks[0]
-    ranges = [(first, min(first + chunk, config.n_stacks)) for first in range(0, config.n_stacks, chunk)]
-    missing = [r for number, r in enumerate(ranges) if not _is_written(path, number)]
-    progress(config.n_stacks - sum(last - first for first, last in missing))
-    for result in _computed(run, missing, workers, scheduler):
-        _write_chunk(store, path, result)
-        progress(result.last - result.first)
-    for leftover in path.rglob("*.partial"):  # of a process that was killed while it wrote
-        leftover.unlink()
+    with _cluster(workers, scheduler) as cluster:
+        store = _open_or_create(run, path, resume, chunk)
+        chunk = store["binary_fraction"].chunks[0]
+        ranges = [(first, min(first + chunk, config.n_stacks)) for first in range(0, config.n_stacks, chunk)]
+        missing = [r for number, r in enumerate(ranges) if not _is_written(path, number)]
+        progress(config.n_stacks - sum(last - first for first, last in missing))
+        for result in _computed(run, missing, cluster):
+            _write_chunk(store, path, result)
+            progress(result.last - result.first)
     return sum(last - first for first, last in missing)
 
 
@@ -233,14 +160,11 @@ class _Run:
 
     def chunk(self, first: int, last: int) -> _Chunk:
         config = self.config
-        stacks = draw_stacks(
-            self.population,
-            n_stars=config.n_stars,
-            binary_fraction=config.binary_fraction,
-            seed=config.seed,
-            first=first,
-            last=last,
-        )
+        draw = {"n_stars": config.n_stars, "binary_fraction": config.binary_fraction, "seed": config.seed}
+        try:
+            stacks = draw_stacks(self.population, first=first, last=last, **draw)  # type: ignore[arg-type]
+        except ValueError as error:
+            raise InputError(str(error)) from None
         shapes = np.empty((3, len(config.psf), last - first))
         for p, name in enumerate(config.psf):
             shape = (
@@ -302,42 +226,62 @@ class _Run:
     @property
     def identity(self) -> str:
         """Hash of all that the numbers depend on."""
-        digest = hashlib.sha256(f"{canonical(self.config)} {self.method} {__version__}".encode())
+        rest = self.config.model_copy(update={"stars": None})  # wherever the stars came from, here they are
+        digest = hashlib.sha256(f"{canonical(rest)} {self.method} {__version__}".encode())
+        digest.update(self.population.stars.band.encode())
         for name in _STAR_COLUMNS:
             digest.update(np.ascontiguousarray(getattr(self.population.stars, name)).tobytes())
         return digest.hexdigest()
 
 
-def _computed(
-    run: _Run, ranges: list[tuple[int, int]], workers: int | None, scheduler: str | None
-) -> Iterator[_Chunk]:
-    """Results of ranges of stacks, in any order, from this process or the workers of a Dask cluster."""
+@contextmanager
+def _cluster(workers: int | None, scheduler: str | None) -> Iterator[_Cluster | None]:
+    """Workers of a Dask cluster, made here or reached by address; None where neither is asked for."""
     if workers is None and scheduler is None:
-        yield from (run.chunk(*one) for one in ranges)
+        yield None
         return
     try:
-        from dask.distributed import Client, LocalCluster, as_completed  # noqa: PLC0415  (an extra)
+        from dask.distributed import Client, LocalCluster  # noqa: PLC0415  (an extra)
     except ImportError:
         raise InputError("needs Dask: install porrima[cluster]", key="workers") from None
     threads = max(1, (os.cpu_count() or 1) // workers) if workers else None
+    local = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
     with ExitStack() as stack:
-        local = {"n_workers": workers, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
         try:
             where = scheduler or stack.enter_context(LocalCluster(**local))
             client = stack.enter_context(Client(where, timeout="10s"))
         except (OSError, ValueError) as error:
             raise InputError(f"cannot be reached ({error})", key="scheduler", value=scheduler) from None
-        shared = client.scatter(run, broadcast=True)
-        waiting = iter(ranges)
-        ahead = 2 * max(1, len(client.scheduler_info()["workers"]))  # bounds what is held in memory
-        first = [
-            client.submit(_chunk_of, shared, *one, threads, pure=False) for one in islice(waiting, ahead)
-        ]
-        queue = as_completed(first)
-        for done in queue:
-            for one in islice(waiting, 1):
-                queue.add(client.submit(_chunk_of, shared, *one, threads, pure=False))
-            yield done.result()
+        yield _Cluster(client=client, threads=threads)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Cluster:
+    """A Dask client, and the threads that each worker may take (None: as many as it likes)."""
+
+    client: Any
+    threads: int | None
+
+
+def _computed(run: _Run, ranges: list[tuple[int, int]], cluster: _Cluster | None) -> Iterator[_Chunk]:
+    """Results of ranges of stacks, in any order, from this process or the workers of a cluster."""
+    if cluster is None:
+        yield from (run.chunk(*one) for one in ranges)
+        return
+    from dask.distributed import as_completed  # noqa: PLC0415  (an extra)
+
+    client = cluster.client
+    shared = client.scatter(run, broadcast=True)
+    waiting = iter(ranges)
+    ahead = 2 * max(1, len(client.scheduler_info()["workers"]))  # bounds what is held in memory
+
+    def submit(n: int) -> list[Any]:
+        return [client.submit(_chunk_of, shared, *r, cluster.threads, pure=False) for r in islice(waiting, n)]
+
+    queue = as_completed(submit(ahead))
+    for done in queue:
+        queue.update(submit(1))
+        yield done.result()
 
 
 def _chunk_of(run: _Run, first: int, last: int, threads: int | None) -> _Chunk:
@@ -349,12 +293,16 @@ def _chunk_of(run: _Run, first: int, last: int, threads: int | None) -> _Chunk:
 
 def _check_output(path: Path, resume: bool) -> None:
     """Refuse a path that cannot be used, before any work is done."""
-    if path.exists() and not resume:
-        raise InputError(
-            "exists already; go on with it by --resume, or choose another", key="output", value=path
-        )
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
-        raise InputError("must lie in a folder that can be written", key="output", value=path)
+    try:
+        if path.exists() and not resume:
+            rule = "exists already; go on with it by --resume, or choose another"
+            raise InputError(rule, key="output", value=path)
+        if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+            raise InputError("must lie in a folder that can be written", key="output", value=path)
+    except OSError as error:  # a name too long, say
+        raise InputError(f"cannot be written ({error.strerror})", key="output", value=path) from None
+    for leftover in path.rglob("*.partial"):  # of a process that was killed while it wrote
+        leftover.unlink(missing_ok=True)
 
 
 def _open_or_create(run: _Run, path: Path, resume: bool, chunk: int) -> Any:
@@ -373,6 +321,8 @@ def _open_or_create(run: _Run, path: Path, resume: bool, chunk: int) -> Any:
     try:
         _create(run, unfinished, min(chunk, run.config.n_stacks))
         unfinished.rename(path)
+    except OSError as error:  # among others, another process was faster
+        raise InputError(f"cannot be written ({error.strerror})", key="output", value=path) from None
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     return zarr.open_group(path, mode="r+")
@@ -401,7 +351,7 @@ def _create(run: _Run, path: Path, chunk: int) -> None:
             "versions": json.dumps(
                 {"porrima": __version__} | {name: version(name) for name in ("numpy", "numba", "galsim")}
             ),
-            "references": "KCM16 (arXiv:1512.01549); Duchene & Kraus 2013; Robin et al. 2003; Bressan et al. 2012",
+            "references": "; ".join(_references(config)),
         },
     )
     known.to_zarr(path, zarr_format=2, consolidated=False)
@@ -422,6 +372,13 @@ def _create(run: _Run, path: Path, chunk: int) -> None:
             attributes={"_ARRAY_DIMENSIONS": list(dimensions)},
         )
     zarr.consolidate_metadata(path)
+
+
+def _references(config: RunConfig) -> list[str]:
+    """Papers that the models of a run ask to be cited."""
+    light = {"main-sequence": "Bressan et al. 2012", "habets-heintze": "Habets & Heintze 1981"}
+    stars = str(config.stars.catalog) if config.stars.catalog else "Robin et al. 2003"
+    return ["KCM16 (arXiv:1512.01549)", "Duchene & Kraus 2013", light[config.photometry.model], stars]
 
 
 def _is_written(path: Path, number: int) -> bool:

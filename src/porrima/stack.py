@@ -52,6 +52,7 @@ BinaryFraction = float | Literal["uniform", "model"]
 
 _FRACTION, _COUNT, _PAIR, _SINGLE = 0, 1, 2, 3  # the stages of a stack, each with a stream of its own
 _MAX_SEED = 2**64
+_MOST_TRIES = 10_000  # pairs drawn for each star of a stack before it is given up: all are resolved
 _BATCH = 64  # stacks that share one thread's room
 _BLOCKS_IN_FLOAT32 = 8  # sums of more blocks than these go on in float64
 
@@ -111,6 +112,8 @@ def draw_stacks(
     sums = np.zeros((last - first, N_MOMENTS))
     unit = np.array([population.cut ** (a + b) for a, b in INDICES])
     _fill(_tables(population), np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
+    if np.any(np.isnan(sums[:, 0])):
+        raise ValueError(f"cut must leave some pairs unresolved at this binary fraction, got {population.cut}")
     return Stacks(binary_fraction=fractions, moments=KernelMoments(values=sums, n_stars=n_stars))
 
 
@@ -236,6 +239,9 @@ def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, list
     pair = block.pair
     taken, filled, resolved, kept, total, lane = 0, 0, 0, 0, 0.0, LANES
     while wanted > 0:
+        if taken > _MOST_TRIES * (n_stars + 100):
+            sums[:] = np.nan
+            return
         if lane == LANES:
             if taken > 0:
                 sum_block(pair, block.sums)

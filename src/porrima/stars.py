@@ -216,7 +216,7 @@ class Stars:
             ``mean_multiplicity_fraction``; None where not known or there is no star.
         """
         low, high = magnitude
-        edges = np.append(np.arange(low, high, 1.0), high)
+        edges = np.append(low + np.arange(np.ceil(high - low - 1e-9)), high)
         rows = []
         for lo, hi in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             inside = (self.magnitude >= lo) & (self.magnitude < hi)

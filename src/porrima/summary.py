@@ -145,15 +145,16 @@ def summarise(run: xr.Dataset, config: RunConfig, population: Population, bins: 
     curves = _at_stacks(population, config, fraction)
     out = {name: np.full((len(config.psf), len(QUANTITIES), bins), np.nan) for name in STATISTICS}
     n_stacks, n_failed = np.bincount(which, minlength=bins), np.zeros((len(config.psf), bins), dtype=int)
+    members = np.split(np.argsort(which, kind="stable"), np.cumsum(n_stacks)[:-1])
     for p in range(len(config.psf)):
         for q, quantity in enumerate(QUANTITIES):
             change = run[quantity][p].to_numpy() - float(run[f"{quantity}_0"][p])
             if quantity == "r2":
                 change /= float(run["r2_0"][p])
-            for k in range(bins):
-                inside = (which == k) & np.isfinite(change)
-                n_failed[p, k] = n_stacks[k] - inside.sum()
-                if inside.sum() >= 2:
+            for k, everyone in enumerate(members):
+                inside = everyone[np.isfinite(change[everyone])]
+                n_failed[p, k] = everyone.size - inside.size
+                if inside.size >= 2:
                     predicted = _average(curves["bias"][p, q, inside], curves["sd"][p, q, inside])
                     for name, value in (statistics(change[inside]) | predicted).items():
                         out[name][p, q, k] = value
@@ -180,7 +181,8 @@ def rows(summary: xr.Dataset) -> list[dict[str, Any]]:
     Returns
     -------
     rows : list of dict
-        Keys ``psf, quantity, f_lo, f_hi, n_stacks`` and `STATISTICS`, dimensionless.
+        Keys ``psf, quantity, f_lo, f_hi, n_stacks, n_failed`` (stacks that could not be measured, and are left
+        out) and `STATISTICS`, dimensionless; NaN where fewer than two stacks are left.
     """
     return [
         {
@@ -189,12 +191,13 @@ def rows(summary: xr.Dataset) -> list[dict[str, Any]]:
             "f_lo": float(summary["f_lo"][k]),
             "f_hi": float(summary["f_hi"][k]),
             "n_stacks": int(summary["n_stacks"][k]),
+            "n_failed": int(summary["n_failed"].sel(psf=psf)[k]),
         }
         | {name: float(summary[name].sel(psf=psf, quantity=quantity)[k]) for name in STATISTICS}
         for psf in summary["psf"].to_numpy()
         for quantity in ("r2", "e1", "e2")
         for k in range(summary.sizes["bin"])
-        if np.isfinite(summary["bias"].sel(psf=psf, quantity=quantity)[k])
+        if int(summary["n_stacks"][k]) > 0
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import os
 import re
 import warnings
 import zlib
@@ -15,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from porrima.errors import InputError
+from porrima.rows import numbers
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -27,21 +29,20 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
 
 __all__ = [
-    "SKY_AREA",
     "CatalogFile",
-    "CatalogRows",
+    "LoadedTable",
     "column_values",
+    "load_columns",
     "load_table",
-    "numbers",
     "open_catalog",
-    "refuse",
+    "write_table",
 ]
 
 
-SKY_AREA = 41253.0
-"""Solid angle of the whole sky, in deg² (4π sr, rounded up)."""
-
 _TEXT = "must be UTF-8 text or a FITS table"
+
+_HEAD = 65536  # bytes in which a file shows its format
+_PIECE = 64_000_000  # bytes of a FITS table in memory at a time
 
 _ASTROPY_TEXT = {"|": "ascii.ipac", "\\": "ascii.ipac", "Title:": "ascii.mrt"}  # how such a file begins
 
@@ -54,18 +55,41 @@ class CatalogFile:
     ----------
     path : Path
         Its name.
-    data : bytes
-        Its content, decompressed.
+    head : bytes
+        Its beginning, decompressed (of a Parquet file the end, where the names are), to know its format by.
     columns : mapping of str to str
         The file's column of each quantity that it names otherwise.
     band : str, optional
         Band of the magnitudes wanted; None for the file's own.
+    options : mapping of str to object
+        What its reader is to do otherwise than by default; see `porrima.rows.parsed_options`.
     """
 
     path: Path
-    data: bytes
+    head: bytes
     columns: Mapping[str, str] = field(default_factory=dict)
     band: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_parquet(self) -> bool:
+        """Whether it is an Apache Parquet file."""
+        return self.head.startswith(b"PAR1")
+
+    def read(self) -> bytes:
+        """All its content, decompressed.
+
+        Returns
+        -------
+        data : bytes
+            The content.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read or is no whole gzip file.
+        """
+        return _bytes(self.path, -1)
 
     def lines(self) -> list[str]:
         r"""Lines of a text file, without their ends (``\n``, ``\r\n`` or ``\r``).
@@ -80,11 +104,12 @@ class CatalogFile:
         InputError
             If the file is not text in UTF-8.
         """
+        data = self.read()
         try:
-            text = self.data.decode("utf-8-sig")
+            text = data.decode("utf-8-sig")
         except UnicodeDecodeError as error:
-            row = self.data.count(b"\n", 0, error.start) + 1
-            value = f"byte 0x{self.data[error.start]:02x}"
+            row = data.count(b"\n", 0, error.start) + 1
+            value = f"byte 0x{data[error.start]:02x}"
             raise InputError(_TEXT, source=self.path, row=row, value=value) from None
         if "\0" in text:
             row = text.count("\n", 0, text.index("\0")) + 1
@@ -93,51 +118,34 @@ class CatalogFile:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CatalogRows:
-    """What a reader found in each of the n rows of a file, unchecked.
+class LoadedTable:
+    """A table as read, unchecked.
 
     Parameters
     ----------
+    table : astropy.table.Table
+        With units and metadata, as far as the file has them.
     row : (n,) int array
         Line of a text file, or row of another table, counted from 1.
-    names : mapping of str to str
-        The file's own column name of each quantity in `values`.
-    values : mapping of str to (n,) float array
-        ``mass`` [M_sun], ``distance`` [pc], ``magnitude`` [mag], ``metallicity`` [dex], ``log_age``
-        [log10 yr] and, where there is one, ``luminosity_class``; NaN where the file gives nothing.
-    component : (n,) str array
-        One of `porrima.stars.COMPONENTS`.
-    band : str
-        Band of the magnitude.
-    area : float, optional
-        Solid angle of the catalogue, in deg².
-    source : str
-        What the catalogue says of itself.
-    pointing : (float, float), optional
-        Galactic longitude and latitude, in deg.
-    assumed : mapping of str to (n,) bool array
-        Reason, and the rows for which something was taken that the file does not say.
+    names : list of str
+        All columns of the file, also those that were not read.
     """
 
+    table: Any
     row: IntArray
-    names: Mapping[str, str]
-    values: Mapping[str, FloatArray]
-    component: NDArray[np.str_]
-    band: str
-    area: float | None = None
-    source: str = ""
-    pointing: tuple[float, float] | None = None
-    assumed: Mapping[str, BoolArray] = field(default_factory=dict)
+    names: list[str]
 
 
-def open_catalog(path: Path, columns: Mapping[str, str], band: str | None) -> CatalogFile:
-    """A file with its content, decompressed if it is gzip'd.
+def open_catalog(
+    path: Path, columns: Mapping[str, str], band: str | None, options: Mapping[str, Any] | None = None
+) -> CatalogFile:
+    """A file that can be read, with its beginning, decompressed if it is gzip'd.
 
     Parameters
     ----------
     path : Path
         The file.
-    columns, band : mapping of str to str, str
+    columns, band, options : mapping, str, mapping
         As in `CatalogFile`.
 
     Returns
@@ -155,91 +163,34 @@ def open_catalog(path: Path, columns: Mapping[str, str], band: str | None) -> Ca
             raise InputError("must be a file, not a directory", source=path)
         if path.exists() and not path.is_file():
             raise InputError("must be a file, not a device", source=path)
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError("must be a readable file", source=path, value=error.strerror) from None
-    except ValueError as error:  # a NUL in the name; InputError is a ValueError too
+    except (OSError, ValueError) as error:  # no permission; a NUL in the name; InputError is a ValueError too
         if isinstance(error, InputError):
             raise
         raise InputError("must be the name of a file", source=repr(str(path))) from None
-    if data.startswith(b"\x1f\x8b"):
-        try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError, zlib.error) as error:
-            raise InputError("must be a whole gzip file", source=path, value=error) from None
-    if not data.strip():
+    head = _bytes(path, _HEAD)
+    if head.startswith(b"PAR1"):
+        head = head[:4] + _bytes(path, -1, skip=max(0, path.stat().st_size - _HEAD))
+    if not head.strip() and (len(head) < _HEAD or not _bytes(path, -1).strip()):
         raise InputError("must not be empty", source=path)
-    return CatalogFile(path=path, data=data, columns=columns, band=band)
+    return CatalogFile(path=path, head=head, columns=columns, band=band, options=options or {})
 
 
-def refuse(path: Path, row: IntArray, column: str, values: FloatArray, bad: BoolArray, rule: str) -> None:
-    """Nothing, where no row breaks a rule.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for the message.
-    row : (n,) int array
-        Number of each row, dimensionless.
-    column : str
-        The file's own name of the column.
-    values : (n,) float array
-        The column, in the unit that the message shows.
-    bad : (n,) bool array
-        Rows that break the rule, dimensionless.
-    rule : str
-        The rule.
-
-    Returns
-    -------
-    None
-        The check has no result.
-
-    Raises
-    ------
-    InputError
-        Names the first row that breaks the rule.
-    """
-    if np.any(bad):
-        k = int(np.argmax(bad))
-        value = "nothing" if np.isnan(values[k]) else f"{values[k]:.10g}"
-        raise InputError(rule, source=path, row=int(row[k]), column=column, value=value)
-
-
-def numbers(path: Path, column: str, texts: list[str], row: IntArray) -> FloatArray:
-    """Numbers of a column from their texts.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for the message.
-    column : str
-        Name of the column.
-    texts : list of str
-        One for each row.
-    row : (n,) int array
-        Number of each row, dimensionless.
-
-    Returns
-    -------
-    numbers : (n,) float array
-        In the file's unit.
-
-    Raises
-    ------
-    InputError
-        If a text is no number; names the first.
-    """
+def _bytes(path: Path, count: int, skip: int = 0) -> bytes:
+    """The first bytes of a file, decompressed, or all for -1."""
     try:
-        return np.array(texts, dtype=float)
+        with path.open("rb") as file:
+            if file.read(2) == b"\x1f\x8b":
+                file.seek(0)
+                with gzip.open(file) as content:
+                    return content.read(count)
+            file.seek(skip)
+            return file.read(count)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise InputError("must be a whole gzip file", source=path, value=error) from None
+    except OSError as error:
+        raise InputError("must be a readable file", source=path, value=error.strerror or error) from None
     except ValueError:
-        for k, text in enumerate(texts):
-            try:
-                float(text)
-            except ValueError:
-                place: dict[str, Any] = {"source": path, "row": int(row[k]), "column": column}
-                raise InputError("must be a number", **place, value=repr(text[:40])) from None
-        raise InputError("must hold numbers", source=path, column=column) from None
+        raise InputError("must be the name of a file", source=repr(str(path))) from None
 
 
 def _astropy(path: Path, read: Callable[[], Any]) -> Any:
@@ -248,6 +199,8 @@ def _astropy(path: Path, read: Callable[[], Any]) -> Any:
         warnings.simplefilter("ignore")
         try:
             return read()
+        except InputError:
+            raise
         except Exception as error:  # it lets through whatever its parsers raise, far beyond ValueError
             reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
             raise InputError("must be a table that astropy reads", source=path, value=reason) from error
@@ -273,21 +226,126 @@ def load_table(file: CatalogFile) -> tuple[Any, IntArray]:
     InputError
         If it is no table; a text row of another length than the header is named.
     """
+    loaded = load_columns(file, None)
+    return loaded.table, loaded.row
+
+
+def load_columns(file: CatalogFile, wanted: Collection[str] | None) -> LoadedTable:
+    """Columns of a table, of which a large FITS file or a Parquet file is not read as a whole.
+
+    Parameters
+    ----------
+    file : CatalogFile
+        Any table that astropy reads; Parquet where pyarrow is installed.
+    wanted : collection of str, optional
+        Names of the columns that may be left out of the result if they are not among these; None for all.
+
+    Returns
+    -------
+    loaded : LoadedTable
+        The columns, the number of each row and all names.
+
+    Raises
+    ------
+    InputError
+        If it is no table; a text row of another length than the header is named.
+    """
     from astropy.table import Table  # noqa: PLC0415  (slow to import, needed for tables only)
 
-    kind = None
-    if file.data.startswith(b"SIMPLE"):
-        kind = "fits"
-    elif re.search(rb"<VOTABLE\b", file.data[:4096]):
-        kind = "votable"
-    else:
+    if file.is_parquet:
+        return _astropy(file.path, partial(_load_parquet, file.path, wanted))  # type: ignore[no-any-return]
+    if file.head.startswith(b"SIMPLE"):
+        return _astropy(file.path, partial(_load_fits, file, wanted))  # type: ignore[no-any-return]
+    kind = "votable" if re.search(rb"<VOTABLE\b", file.head[:4096]) else None
+    if kind is None:
         lines = file.lines()
         begin = next((line.lstrip() for line in lines if line.strip()), "")
         kind = next((kind for sign, kind in _ASTROPY_TEXT.items() if begin.startswith(sign)), None)
         if kind is None:
-            return _load_text(file.path, lines)
-    table = _astropy(file.path, partial(Table.read, io.BytesIO(file.data), format=kind))
-    return table, np.arange(1, len(table) + 1)
+            table, row = _load_text(file.path, lines)
+            return LoadedTable(table=table, row=row, names=list(table.colnames))
+    table = _astropy(file.path, partial(Table.read, io.BytesIO(file.read()), format=kind))
+    return _loaded(table, list(table.colnames))
+
+
+def _loaded(table: Any, names: list[str]) -> LoadedTable:
+    """A table whose rows are counted from 1."""
+    return LoadedTable(table=table, row=np.arange(1, len(table) + 1), names=names)
+
+
+def _load_fits(file: CatalogFile, wanted: Collection[str] | None) -> LoadedTable:
+    """Table of a FITS file; a large one piece by piece, of which the columns wanted are kept."""
+    from astropy.io import fits  # noqa: PLC0415
+    from astropy.table import Table, vstack  # noqa: PLC0415
+
+    path = file.path
+    with path.open("rb") as stream:
+        plain = stream.read(6) == b"SIMPLE"
+    if wanted is None or not plain or path.stat().st_size <= _PIECE:
+        table = Table.read(io.BytesIO(file.read()), format="fits")
+        return _loaded(table, list(table.colnames))
+    with fits.open(path) as units:
+        k = next(k for k, unit in enumerate(units) if isinstance(unit, fits.BinTableHDU))
+        n, width, names = units[k].header["NAXIS2"], units[k].header["NAXIS1"], list(units[k].columns.names)
+    rows = max(1, _PIECE // max(1, width))
+    pieces = []
+    for first in range(0, max(n, 1), rows):
+        with fits.open(path) as units:  # opened anew: what was mapped into memory is given back
+            piece = fits.BinTableHDU(data=units[k].data[first : first + rows], header=units[k].header)
+            table = Table.read(piece)
+            table.keep_columns([name for name in table.colnames if name in wanted])
+            pieces.append(table.copy())
+    return _loaded(vstack(pieces, metadata_conflicts="silent"), names)
+
+
+def _load_parquet(path: Path, wanted: Collection[str] | None) -> LoadedTable:
+    """Columns of a Parquet file."""
+    from astropy.table import Table  # noqa: PLC0415
+
+    try:
+        from pyarrow import parquet  # noqa: PLC0415  (not one of Porrima's own dependencies)
+    except ImportError:
+        rule = "is a Parquet file, which needs the package pyarrow: install it, or convert the file to FITS"
+        raise InputError(rule, source=path) from None
+    names = list(parquet.read_schema(path).names)
+    chosen = names if wanted is None else [name for name in names if name in wanted]
+    if not chosen:
+        return _loaded(Table(), names)
+    return _loaded(Table.read(path, format="parquet", include_names=chosen), names)
+
+
+def write_table(table: Any, path: Path) -> None:
+    """ECSV file of a table that appears whole or not at all.
+
+    Parameters
+    ----------
+    table : astropy.table.Table
+        The table.
+    path : Path
+        The file, replaced if it exists.
+
+    Returns
+    -------
+    None
+        The result is the file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    try:
+        partial_path = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        try:
+            with partial_path.open("x", encoding="utf-8") as stream:
+                table.write(stream, format="ascii.ecsv")
+            os.replace(partial_path, path)
+        finally:
+            partial_path.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError("must be writable", source=path, value=error.strerror) from None
+    except ValueError:  # no name at all, or a NUL in it
+        raise InputError("must be the name of a file", source=repr(str(path))) from None
 
 
 def _load_text(path: Path, lines: list[str]) -> tuple[Any, IntArray]:
