@@ -70,6 +70,15 @@ def test_stars_of_the_galaxy(porrima, tmp_path):
     assert len(back) == result["n"] == sum(c["n"] for c in result["counts"])
 
 
+def test_a_selection_has_a_picture(porrima, stars_file, tmp_path):
+    for name in ("stars.png", "stars.pdf", "stars.svg"):
+        code, _, _ = porrima(
+            "stars", "--catalog", stars_file, "--mag", 18, 19, "--plot", tmp_path / name, "--json"
+        )
+        assert code == 0
+        assert (tmp_path / name).stat().st_size > 1000
+
+
 def test_a_seed_gives_the_same_stars(porrima):
     one, same, other = (
         porrima("stars", "--l", 180, "--b", 45, "--area", 0.1, "--mag", 18, 19, "--seed", s, "--json")[1]
@@ -194,6 +203,7 @@ WRONG = [  # arguments, what the one line says
     (["stars", "--l", "180", "--b", "95"], "b: must be less than or equal to 90, got 95"),
     ([*GALAXY, "--mag", "18"], "--mag"),
     ([*GALAXY, "--area", "0.01", "--mag", "18", "19", "-o", "nowhere/s.ecsv"], "nowhere/s.ecsv"),
+    (["stars", "--catalog", "{stars}", "--plot", "stars.xyz"], "plot: must end in .png, .pdf or .svg, got stars.xyz"),
     (["stars", "--catalog", "{stars}", "--map", "mass"], "--map: must be column=name,column=name, got mass"),
     (["stars", "--catalog", "{stars}", "--format", "trileg"], "format: must be one of besancon, trilegal, gaia, table"),
     (["predict", "--stars", "{stars}", "--mag", "18", "19", "--psf", "psf9"], "psf: must be one of psf0, psf1, psf2"),

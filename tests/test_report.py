@@ -11,8 +11,10 @@ from astropy.table import Table
 from porrima.config import RunConfig, StarsConfig
 from porrima.experiments import errors_and_biases, paper_config
 from porrima.figures import errors_and_biases as drawn
+from porrima.figures import selection
 from porrima.instruments import EUCLID_VIS, KCM16
 from porrima.report import write_report
+from porrima.stars import Stars
 
 
 @pytest.fixture(scope="module")
@@ -120,3 +122,17 @@ def test_the_table_and_the_vector_figure_can_be_read(numbers, tmp_path):
     table = Table.read(tmp_path / "errors_and_biases.ecsv")
     assert len(table) == 3 * 3 * 20
     assert re.search("svg", ElementTree.parse(tmp_path / "errors_and_biases.svg").getroot().tag)
+
+
+def test_a_selection_is_drawn_with_all_its_stars():
+    stars = Stars.from_columns(
+        mass=[0.1, 0.4, 0.9],
+        distance=[100, 500, 3000],
+        magnitude=[18, 18.5, 18.9],
+        component=["thin1", "thick", "thin7"],
+    )
+    figure = selection(stars)
+    for axis in figure.axes:
+        assert sum(patch.get_height() for patch in axis.patches) == 3
+        assert axis.get_xlabel()
+    assert [t.get_text() for t in figure.axes[2].get_legend().get_texts()] == ["thin disc", "thick disc"]

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import sys
-import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.exceptions import TyperException
 
 from porrima.errors import InputError
 from porrima.terminal import Progress, show
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from porrima.config import PopulationConfig
 
 __all__ = ["app", "main"]
 
@@ -82,16 +75,20 @@ def stars(
     multiplicity: MultiplicityName = "dk13",
     seed: Seed = 1,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Picture to write: PNG, PDF or SVG.")] = None,
     as_json: Json = False,
 ) -> None:
     """Stars of the analytic Galaxy, of a real catalogue or of Gaia's archive, selected and counted."""
+    from porrima.answers import gaia_cone, population_config
     from porrima.catalogs import write_stars
+    from porrima.figures import selection
+    from porrima.io import write_figure
     from porrima.sample import catalog_of, draw_stars
 
-    with _cone(gaia, l, b, radius, mag, save, catalog) as cone:
+    with gaia_cone(gaia, l, b, radius, mag, save, catalog) as cone:
         if cone is not None:
             l, b, catalog, format = None, None, cone, "gaia"  # noqa: A001
-        config = _population_config(
+        config = population_config(
             l=l, b=b, catalog=catalog, format=format, map=map, options=options, band=band, mag=mag, seed=seed,
             multiplicity=multiplicity, area=area if catalog is None else None,
         )  # fmt: skip
@@ -101,6 +98,8 @@ def stars(
     counts = selected.counts(mag, law.multiplicity_fraction)
     if output is not None:
         write_stars(selected, output)
+    if plot is not None:
+        write_figure(selection(selected), plot)
     result: dict[str, Any] = {"n": len(selected), "area_deg2": selected.area, "counts": counts}
     header = f"{len(selected)} stars, {selected.source}"
     if read is not None:
@@ -174,6 +173,7 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Bias and error of the PSF's shape in closed form."""
+    from porrima.answers import population_config, predicted
     from porrima.psf import psf_from_name
     from porrima.response import response
     from porrima.shapes import estimator_from_name
@@ -187,12 +187,12 @@ def predict(
         raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     if n_stars is not None and n_stars < 1:
         raise InputError("must be at least 1", key="--n-stars", value=n_stars)
-    config = _population_config(
+    config = population_config(
         l=l, b=b, catalog=catalog, format=format, map=map, options=options, band=band, mag=mag, seed=seed,
         multiplicity=multiplicity, photometry=photometry, cut=cut, stack_weight=stack_weight,
     )  # fmt: skip
     reply = response(psf_from_name(psf), estimator_from_name(estimator))
-    result = _predicted(config, reply, binary_fraction, n_stars)
+    result = predicted(config, reply, binary_fraction, n_stars)
     header = f"{result['n_catalog_stars']} stars, {psf}, {estimator}, {multiplicity}"
     show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
 
@@ -255,6 +255,7 @@ def summary(
     as_json: Json = False,
 ) -> None:
     """Bias and error per range of binary fraction, with standard errors and predictions."""
+    from porrima.answers import NUMBER_COLUMNS, number_lines
     from porrima.io import write_rows
     from porrima.simulation import open_run
     from porrima.summary import rows, summarise
@@ -268,7 +269,7 @@ def summary(
     if failed > 0:
         note = f"warning: up to {failed:.1%} of the stacks of a bin could not be measured and are left out, the widest"
         print(f"{note} pairs first: the numbers are low; use --method images", file=sys.stderr)
-    show({"bins": result}, as_json, str(run), _NUMBER_COLUMNS, _numbers(result))
+    show({"bins": result}, as_json, str(run), NUMBER_COLUMNS, number_lines(result))
 
 
 @app.command()
@@ -281,6 +282,7 @@ def paper(
     as_json: Json = False,
 ) -> None:
     """The paper's figure of errors and biases against binary fraction, with its numbers."""
+    from porrima.answers import NUMBER_COLUMNS, number_lines
     from porrima.experiments import errors_and_biases, paper_config
     from porrima.io import make_folder
     from porrima.report import write_report
@@ -299,7 +301,7 @@ def paper(
         "wall_s": time.perf_counter() - start,
     }
     near = [row for row in rows(numbers.summary) if row["f_lo"] <= 0.35 < row["f_hi"]]
-    show(result, as_json, f"report: {report}", _NUMBER_COLUMNS, _numbers(near))
+    show(result, as_json, f"report: {report}", NUMBER_COLUMNS, number_lines(near))
 
 
 @app.command()
@@ -386,119 +388,3 @@ def main() -> None:
 def _fail(message: str, code: int) -> int:
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
     return code
-
-
-@contextlib.contextmanager
-def _cone(
-    gaia: bool,
-    l: float | None,
-    b: float | None,
-    radius: float | None,
-    mag: tuple[float, float],
-    save: Path | None,
-    catalog: Path | None,
-) -> Iterator[Path | None]:
-    """File of a circle of Gaia's archive, which goes when it need not be saved; None where not asked for."""
-    given = {"--catalog": catalog} if gaia else {"--radius": radius, "--save": save}
-    for key, value in given.items():
-        if value is not None:
-            rule = "cannot be given together with --gaia" if gaia else "needs --gaia"
-            raise InputError(rule, key=key, value=value)
-    if not gaia:
-        yield None
-        return
-    if l is None or b is None or radius is None:
-        raise InputError("needs --l, --b and --radius", key="--gaia")
-    from porrima.gaia import fetch_cone
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = save or Path(folder) / "gaia.ecsv"
-        fetch_cone(l, b, radius, mag, path)
-        yield path
-
-
-def _population_config(**options: Any) -> PopulationConfig:
-    """Configuration from the options of a command, checked by the same rules as a file."""
-    from porrima.config import PopulationConfig, parse
-
-    where = ("l", "b", "catalog", "format", "map", "options", "band", "mag", "area")
-    for name, rule in (("map", "column=name,column=name"), ("options", "option=value,option=value")):
-        if options.get(name) is not None:
-            parts = [part.split("=") for part in options[name].split(",")]
-            if any(len(part) != 2 or not all(part) for part in parts):
-                raise InputError(f"must be {rule}", key=f"--{name}", value=options[name])
-            options[name] = dict(parts)
-    for name in ("multiplicity", "photometry"):
-        if str(options.get(name, "")).startswith("{"):
-            options[name] = _model_with_options(name, options[name])
-    given = {key: value for key, value in options.items() if value is not None}
-    stars = {key: value for key, value in given.items() if key in where}
-    rest = {key: value for key, value in given.items() if key not in where}
-    return parse(PopulationConfig, {"stars": stars} | rest)
-
-
-def _model_with_options(name: str, text: str) -> Any:
-    """A model with options as a configuration has it, such as {model: dk13, gap_rule: solar}."""
-    import yaml
-
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise InputError(
-            "must be a name or {model: name, option: value}", key=f"--{name}", value=text
-        ) from None
-
-
-def _predicted(
-    config: PopulationConfig, reply: Any, binary_fraction: float | None, n_stars: int | None
-) -> dict[str, Any]:
-    """What `predict` shows."""
-    import numpy as np
-
-    from porrima.prediction import QUANTITIES, integrate, population_moments
-    from porrima.prediction import predict as predicted
-    from porrima.sample import draw_stars, population_of
-
-    population = population_of(config, draw_stars(config))
-    fraction = None if binary_fraction is None else np.array([binary_fraction])
-    moments = population_moments(population, integrate(population), fraction)
-    prediction = predicted(moments, reply, n_stars)
-    if np.any(np.isnan(prediction.bias)):
-        rule = "is too wide for the kernel moments of this PSF: use --estimator plain, or simulate --method images"
-        raise InputError(rule, key="--cut", value=config.cut)
-    errors = {
-        f"{name}_{quantity}": value
-        for name in ("bias", "sigma", "sd")
-        for quantity, value in zip(QUANTITIES, getattr(prediction, name)[:, 0], strict=True)
-    }
-    return {
-        "mean_x": moments.mean_x[0],
-        "mean_x2": moments.mean_x2[0],
-        "eta": prediction.eta[0],
-        **errors,
-        "n_stars": n_stars,
-        "effective_n_stars": None if n_stars is None else n_stars * moments.effective_share[0],
-        "binary_fraction": binary_fraction,
-        "population_binary_fraction": moments.binary_fraction[0],
-        "unresolved_fraction": moments.unresolved_fraction[0],
-        "removed_fraction": moments.removed_fraction[0],
-        "n_catalog_stars": len(population.stars),
-    }
-
-
-_NUMBER_COLUMNS = [
-    "PSF", "quantity", "binary fraction", "stacks", "bias", "predicted", "sigma", "predicted", "sd", "predicted",
-]  # fmt: skip
-
-
-def _numbers(rows: list[dict[str, Any]]) -> list[list[Any]]:
-    """Lines of a summary for the terminal: each number with its standard error, beside the prediction."""
-    return [
-        [row["psf"], row["quantity"], f"{row['f_lo']:.2f}-{row['f_hi']:.2f}", row["n_stacks"]]
-        + [
-            text
-            for name in ("bias", "sigma", "sd")
-            for text in (f"{row[name]:.2e} ± {row[f'{name}_se']:.0e}", f"{row[f'prediction_{name}']:.2e}")
-        ]
-        for row in rows
-    ]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from porrima.instruments import Requirement
+    from porrima.stars import Stars
 
-__all__ = ["errors_and_biases", "galaxy_against_catalog", "population", "responses", "toy_maps"]
+__all__ = ["errors_and_biases", "galaxy_against_catalog", "population", "responses", "selection", "toy_maps"]
 
 _COLOURS = (
     "#0072b2",
@@ -60,8 +63,6 @@ def errors_and_biases(
     figure : Figure
         Ready to be written.
     """
-    from matplotlib import rc_context  # noqa: PLC0415  (its state is set for this figure only)
-
     with rc_context(_STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(7.4, 8.4), layout="constrained")
         axes = figure.subplots(3, 2, sharex=True)
@@ -132,6 +133,53 @@ _SCANS = (
 )
 
 
+def selection(stars: Stars) -> Figure:
+    """Three panels: how the stars of a selection are distributed in magnitude, mass and distance, by component.
+
+    Parameters
+    ----------
+    stars : Stars
+        The selection: mag, M_sun, pc.
+
+    Returns
+    -------
+    figure : Figure
+        Ready to be written.
+    """
+    groups = {
+        "thin disc": "thin",
+        "thick disc": "thick",
+        "halo": "halo",
+        "bulge": "bulge",
+        "component unknown": "unknown",
+    }
+    names = [n for n, start in groups.items() if np.any(np.char.startswith(stars.component, start))]
+    masks = [np.char.startswith(stars.component, groups[name]) for name in names]
+    with rc_context(_STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(8.6, 3.1), layout="constrained")
+        axes = figure.subplots(1, 3)
+        per = f" per deg² ({stars.area:g} deg²)" if stars.area else ""
+        for axis, values, label, scale in (
+            (axes[0], stars.magnitude, f"{stars.band} [mag]", "linear"),
+            (axes[1], stars.mass, r"mass [M$_\odot$]", "log"),
+            (axes[2], stars.distance, "distance [pc]", "log"),
+        ):
+            space = np.geomspace if scale == "log" else np.linspace
+            edges = space(values.min(), values.max() * (1 + 1e-9), 31)
+            weights = [np.full(int(m.sum()), 1 / stars.area if stars.area else 1.0) for m in masks]
+            axis.hist([values[m] for m in masks], edges, weights=weights, stacked=True, label=names,
+                      color=_COLOURS[: len(names)])  # fmt: skip
+            axis.set_xscale(scale)
+            axis.set_xlabel(label)
+        axes[0].set_ylabel("stars in each bin" + per)
+        axes[1].xaxis.set_major_locator(FixedLocator([0.1, 0.2, 0.5, 1.0]))
+        axes[1].xaxis.set_major_formatter("{x:g}")
+        axes[1].xaxis.set_minor_locator(NullLocator())
+        axes[2].legend(frameon=False, fontsize=8)
+        figure.suptitle(f"{len(stars)} main-sequence stars, {stars.source}", fontsize=9)
+    return figure
+
+
 def population(dataset: xr.Dataset) -> Figure:
     """Share of mass classes, and mean binary fraction, against latitude and longitude (KCM16 Sect. 4.3).
 
@@ -145,8 +193,6 @@ def population(dataset: xr.Dataset) -> Figure:
     figure : Figure
         Ready to be written.
     """
-    from matplotlib import rc_context  # noqa: PLC0415  (its state is set for this figure only)
-
     with rc_context(_STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(7.4, 5.4), layout="constrained")
         axes = figure.subplots(2, 3, sharex="col", sharey="row")
@@ -200,8 +246,6 @@ def galaxy_against_catalog(datasets: list[xr.Dataset]) -> Figure:
     figure : Figure
         Ready to be written.
     """
-    from matplotlib import rc_context  # noqa: PLC0415  (its state is set for this figure only)
-
     with rc_context(_STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(7.4, 9.0), layout="constrained")
         axes = figure.subplots(len(_BESIDE), len(datasets), sharex=True, sharey="row", squeeze=False)
@@ -259,7 +303,6 @@ def toy_maps(maps: xr.Dataset) -> Figure:
     figure : Figure
         A row for each quantity, a column for each PSF and contrast; the red line lies along the PSF.
     """
-    from matplotlib import rc_context  # noqa: PLC0415  (its state is set for this figure only)
     from matplotlib.colors import Normalize, SymLogNorm  # noqa: PLC0415
 
     columns = [(p, m) for p in range(maps.sizes["psf"]) for m in range(maps.sizes["delta_m"])]
@@ -313,8 +356,6 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
     figure : Figure
         Lines at 1: the formulae of KCM16.
     """
-    from matplotlib import rc_context  # noqa: PLC0415  (its state is set for this figure only)
-
     groups = list(dict.fromkeys(row["group"] for row in rows))
     estimators = list(dict.fromkeys(row["kind"] for row in rows))
     with rc_context(_STYLE):  # type: ignore[arg-type]

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-__all__ = ["make_folder", "read_systems", "write_rows", "write_whole"]
+    from matplotlib.figure import Figure
+
+__all__ = ["make_folder", "read_systems", "write_figure", "write_rows", "write_whole"]
 
 _PAIR_COLUMNS = {"flux_ratio": "", "dx": "arcsec", "dy": "arcsec"}
 _WIDEST = 10.0  # arcsec; what is wider is no unresolved pair for any survey
@@ -143,3 +145,31 @@ def write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
     table = Table(rows=list(rows))
     write_whole(path, lambda unfinished: table.write(unfinished, format="ascii.ecsv"))
+
+
+_NO_DATE: dict[str, dict[str, Any]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """A figure as PNG, PDF or SVG, the same bytes for the same numbers.
+
+    Parameters
+    ----------
+    figure : Figure
+        From `figures`.
+    path : Path
+        The file, replaced if it exists; its suffix is the format.
+
+    Returns
+    -------
+    None
+        The result is the file.
+
+    Raises
+    ------
+    InputError
+        If the suffix is of no such format.
+    """
+    if path.suffix not in (".png", ".pdf", ".svg"):
+        raise InputError("must end in .png, .pdf or .svg", key="plot", value=path)
+    write_whole(path, lambda part: figure.savefig(part, dpi=160, metadata=_NO_DATE.get(path.suffix, {})))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import io
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from porrima import __version__
 from porrima.figures import errors_and_biases
 from porrima.instruments import KCM16
-from porrima.io import write_rows, write_whole
+from porrima.io import write_figure, write_rows, write_whole
 from porrima.summary import rows
 
 if TYPE_CHECKING:
@@ -85,23 +85,17 @@ def write_report(numbers: ErrorsAndBiases, folder: Path) -> Path:
     """
     figure = errors_and_biases(numbers.summary, numbers.curves, numbers.limit, KCM16)
     for suffix in ("svg", "pdf", "png"):
-        write_whole(
-            folder / f"errors_and_biases.{suffix}",
-            lambda path: figure.savefig(path, dpi=160, metadata=_NO_DATE.get(path.suffix[1:], {})),
-        )
+        write_figure(figure, folder / f"errors_and_biases.{suffix}")
     write_rows(rows(numbers.summary), folder / "errors_and_biases.ecsv")
     page = folder / "index.html"
     write_whole(page, lambda path: path.write_text(_page(numbers, figure), encoding="utf-8"))
     return page
 
 
-_NO_DATE: dict[str, dict[str, Any]] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
-
-
 def _page(numbers: ErrorsAndBiases, figure: Figure) -> str:
     config = numbers.config
     svg = io.StringIO()
-    figure.savefig(svg, format="svg", metadata=_NO_DATE["svg"])
+    figure.savefig(svg, format="svg", metadata={"Date": None})
     where = config.stars
     stars = (
         f"l = {where.l:g}°, b = {where.b:g}° of the analytic Galaxy"

@@ -1,0 +1,200 @@
+"""From the options of a command to what it shows: configurations checked, results as the contract names them."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+
+from porrima.config import PopulationConfig, parse
+from porrima.errors import InputError
+from porrima.gaia import fetch_cone
+from porrima.prediction import QUANTITIES, integrate, population_moments, predict
+from porrima.sample import draw_stars, population_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["NUMBER_COLUMNS", "gaia_cone", "number_lines", "population_config", "predicted"]
+
+
+@contextmanager
+def gaia_cone(
+    gaia: bool,
+    l: float | None,
+    b: float | None,
+    radius: float | None,
+    mag: tuple[float, float],
+    save: Path | None,
+    catalog: Path | None,
+) -> Iterator[Path | None]:
+    """File of a circle of Gaia's archive, which goes when it need not be saved; None where not asked for.
+
+    Parameters
+    ----------
+    gaia : bool
+        Whether it is asked for.
+    l, b, radius : float or None
+        Centre and radius of the circle, in deg.
+    mag : (float, float)
+        Range of G, in mag.
+    save : Path or None
+        Where the archive's table is to stay.
+    catalog : Path or None
+        Must not be given with `gaia`.
+
+    Yields
+    ------
+    path : Path or None
+        The table.
+
+    Returns
+    -------
+    None
+        A context manager.
+
+    Raises
+    ------
+    InputError
+        If options are missing, exclude each other, or the archive does not answer.
+    """
+    given = {"--catalog": catalog} if gaia else {"--radius": radius, "--save": save}
+    for key, value in given.items():
+        if value is not None:
+            rule = "cannot be given together with --gaia" if gaia else "needs --gaia"
+            raise InputError(rule, key=key, value=value)
+    if not gaia:
+        yield None
+        return
+    if l is None or b is None or radius is None:
+        raise InputError("needs --l, --b and --radius", key="--gaia")
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = save or Path(folder) / "gaia.ecsv"
+        fetch_cone(l, b, radius, mag, path)
+        yield path
+
+
+def population_config(**options: Any) -> PopulationConfig:
+    """Configuration from the options of a command, checked by the same rules as a file.
+
+    Returns
+    -------
+    config : PopulationConfig
+        Validated.
+
+    Raises
+    ------
+    InputError
+        Naming the option, the rule and the value.
+    """
+    where = ("l", "b", "catalog", "format", "map", "options", "band", "mag", "area")
+    for name, rule in (("map", "column=name,column=name"), ("options", "option=value,option=value")):
+        if options.get(name) is not None:
+            parts = [part.split("=") for part in options[name].split(",")]
+            if any(len(part) != 2 or not all(part) for part in parts):
+                raise InputError(f"must be {rule}", key=f"--{name}", value=options[name])
+            options[name] = dict(parts)
+    for name in ("multiplicity", "photometry"):
+        if str(options.get(name, "")).startswith("{"):
+            options[name] = _model_with_options(name, options[name])
+    given = {key: value for key, value in options.items() if value is not None}
+    stars = {key: value for key, value in given.items() if key in where}
+    rest = {key: value for key, value in given.items() if key not in where}
+    return parse(PopulationConfig, {"stars": stars} | rest)
+
+
+def _model_with_options(name: str, text: str) -> Any:
+    """A model with options as a configuration has it, such as {model: dk13, gap_rule: solar}."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(
+            "must be a name or {model: name, option: value}", key=f"--{name}", value=text
+        ) from None
+
+
+def predicted(
+    config: PopulationConfig, reply: Any, binary_fraction: float | None, n_stars: int | None
+) -> dict[str, Any]:
+    """What `predict` shows.
+
+    Parameters
+    ----------
+    config : PopulationConfig
+        Stars and companions.
+    reply : Response
+        Of PSF and estimator.
+    binary_fraction : float or None
+        In [0, 1]; None for the model's own.
+    n_stars : int or None
+        In the stack (count); None for infinitely many.
+
+    Returns
+    -------
+    answer : dict
+        The keys of the contract: arcsec², arcsec⁴ and dimensionless.
+
+    Raises
+    ------
+    InputError
+        If the cut is too wide for kernel moments.
+    """
+    population = population_of(config, draw_stars(config))
+    fraction = None if binary_fraction is None else np.array([binary_fraction])
+    moments = population_moments(population, integrate(population), fraction)
+    prediction = predict(moments, reply, n_stars)
+    if np.any(np.isnan(prediction.bias)):
+        rule = "is too wide for the kernel moments of this PSF: use --estimator plain, or simulate --method images"
+        raise InputError(rule, key="--cut", value=config.cut)
+    errors = {
+        f"{name}_{quantity}": value
+        for name in ("bias", "sigma", "sd")
+        for quantity, value in zip(QUANTITIES, getattr(prediction, name)[:, 0], strict=True)
+    }
+    return {
+        "mean_x": moments.mean_x[0],
+        "mean_x2": moments.mean_x2[0],
+        "eta": prediction.eta[0],
+        **errors,
+        "n_stars": n_stars,
+        "effective_n_stars": None if n_stars is None else n_stars * moments.effective_share[0],
+        "binary_fraction": binary_fraction,
+        "population_binary_fraction": moments.binary_fraction[0],
+        "unresolved_fraction": moments.unresolved_fraction[0],
+        "removed_fraction": moments.removed_fraction[0],
+        "n_catalog_stars": len(population.stars),
+    }
+
+
+NUMBER_COLUMNS = [
+    "PSF", "quantity", "binary fraction", "stacks", "bias", "predicted", "sigma", "predicted", "sd", "predicted",
+]  # fmt: skip
+
+
+def number_lines(rows: list[dict[str, Any]]) -> list[list[Any]]:
+    """Lines of a summary for the terminal: each number with its standard error, beside the prediction.
+
+    Parameters
+    ----------
+    rows : list of dict
+        From `summary.rows`, dimensionless.
+
+    Returns
+    -------
+    lines : list of list
+        Under `NUMBER_COLUMNS`.
+    """
+    return [
+        [row["psf"], row["quantity"], f"{row['f_lo']:.2f}-{row['f_hi']:.2f}", row["n_stacks"]]
+        + [
+            text
+            for name in ("bias", "sigma", "sd")
+            for text in (f"{row[name]:.2e} ± {row[f'{name}_se']:.0e}", f"{row[f'prediction_{name}']:.2e}")
+        ]
+        for row in rows
+    ]
