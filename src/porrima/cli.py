@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -50,6 +51,11 @@ PhotometryName = Annotated[
     ),
 ]
 Psf = Annotated[str, typer.Option("--psf", help="Name of the PSF.")]
+Pixel = Annotated[float | None, typer.Option("--pixel", help="Side of a pixel to convolve with [arcsec].")]
+PixelScale = Annotated[float | None, typer.Option("--pixel-scale", help="Of a FITS image [arcsec].")]
+Jitter = Annotated[
+    float | None, typer.Option("--jitter", help="Sigma of a Gaussian to convolve with [arcsec].")
+]
 EstimatorName = Annotated[
     str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")
 ]
@@ -133,6 +139,9 @@ def measure(
     method: Annotated[
         Literal["response", "images"], typer.Option(help="Moments, or GalSim images.")
     ] = "response",
+    pixel: Pixel = None,
+    pixel_scale: PixelScale = None,
+    jitter: Jitter = None,
     as_json: Json = False,
 ) -> None:
     """Shape of one stack of the pairs in a table, and its change against the PSF without companions."""
@@ -142,7 +151,8 @@ def measure(
     from porrima.shapes import estimator_from_name
 
     systems = read_systems(table)
-    result = measured(table, systems, psf_from_name(psf), estimator_from_name(estimator), method)
+    profile = psf_from_name(psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter)
+    result = measured(table, systems, profile, estimator_from_name(estimator), method)
     header = f"{len(systems)} systems, {psf}, {estimator}, {method}"
     show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
 
@@ -159,6 +169,9 @@ def predict(
     b: Latitude = None,
     mag: Mag,
     psf: Psf,
+    pixel: Pixel = None,
+    pixel_scale: PixelScale = None,
+    jitter: Jitter = None,
     estimator: EstimatorName = "adaptive",
     binary_fraction: Annotated[
         float | None, typer.Option(help="0 to 1; as the model gives it if not given.")
@@ -191,7 +204,8 @@ def predict(
         l=l, b=b, catalog=catalog, format=format, map=map, options=options, band=band, mag=mag, seed=seed,
         multiplicity=multiplicity, photometry=photometry, cut=cut, stack_weight=stack_weight,
     )  # fmt: skip
-    reply = response(psf_from_name(psf), estimator_from_name(estimator))
+    profile = psf_from_name(psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter)
+    reply = response(profile, estimator_from_name(estimator))
     result = predicted(config, reply, binary_fraction, n_stars)
     header = f"{result['n_catalog_stars']} stars, {psf}, {estimator}, {multiplicity}"
     show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
@@ -372,6 +386,7 @@ def main() -> None:
         The process exits.
     """
     arguments = sys.argv[1:] or ["--help"]
+    warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
     try:
         code = typer.main.get_command(app).main(arguments, prog_name="porrima", standalone_mode=False)
     except InputError as error:

@@ -149,10 +149,18 @@ class RunConfig(PopulationConfig):
     """A whole run of `porrima simulate`."""
 
     psf: tuple[str, ...] = Field(default=("psf0", "psf1", "psf2"), min_length=1)
+    pixel: float | None = Field(default=None, gt=0, allow_inf_nan=False)  # arcsec, convolved with each PSF
+    pixel_scale: float | None = Field(default=None, gt=0, allow_inf_nan=False)  # arcsec, of FITS images
+    jitter: float | None = Field(default=None, gt=0, allow_inf_nan=False)  # arcsec, sigma of a Gaussian
     estimator: str = "adaptive"
     n_stars: int = Field(default=40, ge=1, le=10**9, strict=True)
     n_stacks: int = Field(default=100_000, ge=1, le=10**10, strict=True)
     binary_fraction: float | Literal["uniform", "model"] = "uniform"
+
+    @property
+    def psf_options(self) -> dict[str, Any]:
+        """What `psf.psf_from_name` is to add to each PSF, in arcsec."""
+        return {"pixel": self.pixel, "pixel_scale": self.pixel_scale, "jitter": self.jitter}
 
     @field_validator("psf", mode="before")
     @classmethod

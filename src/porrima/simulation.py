@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from porrima.psf import PSF
     from porrima.shapes import Shape
     from porrima.systems import Population
 
@@ -181,8 +182,11 @@ class _Run:
             moments=stacks.moments.values,
         )
 
+    def _psf(self, name: str) -> PSF:
+        return psf_from_name(name, **self.config.psf_options)
+
     def _from_moments(self, psf: str, moments: KernelMoments) -> Shape:
-        return response(psf_from_name(psf), estimator_from_name(self.config.estimator)).shapes(moments)
+        return response(self._psf(psf), estimator_from_name(self.config.estimator)).shapes(moments)
 
     def _from_images(self, psf: str, first: int, last: int) -> Shape:
         from porrima.images import measure_stack  # noqa: PLC0415  (GalSim's drawing, where used)
@@ -190,7 +194,7 @@ class _Run:
         config = self.config
         shapes = [
             measure_stack(
-                psf_from_name(psf),
+                self._psf(psf),
                 draw_systems(
                     self.population,
                     n_stars=config.n_stars,
@@ -218,7 +222,7 @@ class _Run:
 
         zero = np.zeros(1)
         return measure_stack(
-            psf_from_name(psf),
+            self._psf(psf),
             Systems.from_pairs(zero, zero, zero),
             estimator_from_name(self.config.estimator),
         )

@@ -96,7 +96,8 @@ def predicted_curves(
     grid = np.linspace(0.0, 1.0, _FRACTIONS) if fractions is None else fractions
     moments = population_moments(population, integrate(population), grid)
     estimator = estimator_from_name(config.estimator)
-    predictions = [predict(moments, response(psf_from_name(p), estimator), n_stars) for p in config.psf]
+    psfs = [psf_from_name(name, **config.psf_options) for name in config.psf]
+    predictions = [predict(moments, response(psf, estimator), n_stars) for psf in psfs]
     dimensions = ("psf", "quantity", "binary_fraction")
     return xr.Dataset(
         {
