@@ -19,7 +19,13 @@ from porrima.sample import draw_stars, population_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["NUMBER_COLUMNS", "gaia_cone", "number_lines", "population_config", "predicted"]
+    from porrima.catalogs import Catalog
+    from porrima.stars import Stars
+
+__all__ = [
+    "COUNT_COLUMNS", "NUMBER_COLUMNS", "count_lines", "gaia_cone", "number_lines", "population_config", "predicted",
+    "stars_answer",
+]  # fmt: skip
 
 
 @contextmanager
@@ -169,6 +175,53 @@ def predicted(
         "removed_fraction": moments.removed_fraction[0],
         "n_catalog_stars": len(population.stars),
     }
+
+
+COUNT_COLUMNS = ["stars", "per deg²", "median distance [pc]", "mean mass [M_sun]", "multiplicity fraction"]
+
+
+def stars_answer(
+    stars: Stars, counts: list[dict[str, Any]], catalog: Catalog | None
+) -> tuple[dict[str, Any], str]:
+    """What `stars` shows: the keys of the contract, and a header for the terminal.
+
+    Parameters
+    ----------
+    stars : Stars
+        The selection.
+    counts : list of dict
+        From `Stars.counts`.
+    catalog : Catalog or None
+        Where they come from, with the account of its rows; None for the analytic Galaxy.
+
+    Returns
+    -------
+    answer, header : dict, str
+        Area in deg².
+    """
+    answer: dict[str, Any] = {"n": len(stars), "area_deg2": stars.area, "counts": counts}
+    header = f"{len(stars)} stars, {stars.source}"
+    if catalog is not None:
+        answer |= {"rejected": dict(catalog.rejected), "assumed": dict(catalog.assumed)}
+        for name in ("rejected", "assumed"):
+            header += "".join(f"\n{name}: {count} {reason}" for reason, count in answer[name].items())
+    return answer, header
+
+
+def count_lines(counts: list[dict[str, Any]]) -> list[list[Any]]:
+    """Lines of the counts for the terminal, under the band and `COUNT_COLUMNS`.
+
+    Parameters
+    ----------
+    counts : list of dict
+        From `Stars.counts`, mag.
+
+    Returns
+    -------
+    lines : list of list
+        One per magnitude.
+    """
+    return [[f"{c['mag_lo']:g}-{c['mag_hi']:g}", *list(c.values())[2:]] for c in counts]
 
 
 NUMBER_COLUMNS = [

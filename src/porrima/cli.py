@@ -6,7 +6,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 from typer.exceptions import TyperException
@@ -85,7 +85,7 @@ def stars(
     as_json: Json = False,
 ) -> None:
     """Stars of the analytic Galaxy, of a real catalogue or of Gaia's archive, selected and counted."""
-    from porrima.answers import gaia_cone, population_config
+    from porrima.answers import COUNT_COLUMNS, count_lines, gaia_cone, population_config, stars_answer
     from porrima.catalogs import write_stars
     from porrima.figures import selection
     from porrima.io import write_figure
@@ -106,27 +106,8 @@ def stars(
         write_stars(selected, output)
     if plot is not None:
         write_figure(selection(selected), plot)
-    result: dict[str, Any] = {"n": len(selected), "area_deg2": selected.area, "counts": counts}
-    header = f"{len(selected)} stars, {selected.source}"
-    if read is not None:
-        result |= {"rejected": dict(read.rejected), "assumed": dict(read.assumed)}
-        for name in ("rejected", "assumed"):
-            header += "".join(f"\n{name}: {count} {reason}" for reason, count in result[name].items())
-    table = [[f"{c['mag_lo']:g}-{c['mag_hi']:g}", *list(c.values())[2:]] for c in counts]
-    show(
-        result,
-        as_json,
-        header,
-        [
-            selected.band,
-            "stars",
-            "per deg²",
-            "median distance [pc]",
-            "mean mass [M_sun]",
-            "multiplicity fraction",
-        ],
-        table,
-    )
+    result, header = stars_answer(selected, counts, read)
+    show(result, as_json, header, [selected.band, *COUNT_COLUMNS], count_lines(counts))
 
 
 @app.command()

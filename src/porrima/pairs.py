@@ -215,6 +215,30 @@ def _flux_ratios(grid, start, step, offset, log_dark, star, pair):  # type: igno
         pair[FLUX_RATIO + lane] = ratio if log_mass >= log_dark else float32(0)
 
 
+@njit(inline="always", fastmath={"contract"})
+def _add3(sums, row, factor, a, b, c):  # type: ignore[no-untyped-def]
+    sums[row] += factor * a
+    sums[row + LANES] += factor * b
+    sums[row + 2 * LANES] += factor * c
+
+
+@njit(inline="always", fastmath={"contract"})
+def _add4(sums, row, factor, a, b, c, d):  # type: ignore[no-untyped-def]
+    sums[row] += factor * a
+    sums[row + LANES] += factor * b
+    sums[row + 2 * LANES] += factor * c
+    sums[row + 3 * LANES] += factor * d
+
+
+@njit(inline="always", fastmath={"contract"})
+def _add5(sums, row, factor, a, b, c, d, e):  # type: ignore[no-untyped-def]
+    sums[row] += factor * a
+    sums[row + LANES] += factor * b
+    sums[row + 2 * LANES] += factor * c
+    sums[row + 3 * LANES] += factor * d
+    sums[row + 4 * LANES] += factor * e
+
+
 @njit(fastmath={"contract"}, error_model="numpy")
 def sum_block(pair, sums):  # type: ignore[no-untyped-def]
     """Add the kernel moments c_n x^a y^b of the kept pairs of a block, c_n = phi_1 (-phi_2)^n + phi_2 phi_1^n.
@@ -231,73 +255,35 @@ def sum_block(pair, sums):  # type: ignore[no-untyped-def]
         near = kept * primary * companion * companion
         far = kept * companion * primary * primary
         m20, m11, m02 = a * a, a * b, b * b
-        c = near + far
-        sums[0 * LANES + lane] += c * m20
-        sums[1 * LANES + lane] += c * m11
-        sums[2 * LANES + lane] += c * m02
+        _add3(sums, 0 * LANES + lane, near + far, m20, m11, m02)
         near, far = near * -companion, far * primary
         m30, m21 = m20 * a, m11 * a
         m12, m03 = m02 * a, m02 * b
-        c = near + far
-        sums[3 * LANES + lane] += c * m30
-        sums[4 * LANES + lane] += c * m21
-        sums[5 * LANES + lane] += c * m12
-        sums[6 * LANES + lane] += c * m03
+        _add4(sums, 3 * LANES + lane, near + far, m30, m21, m12, m03)
         near, far = near * -companion, far * primary
         m40, m31, m22 = m30 * a, m21 * a, m12 * a
         m13, m04 = m03 * a, m03 * b
-        c = near + far
-        sums[7 * LANES + lane] += c * m40
-        sums[8 * LANES + lane] += c * m31
-        sums[9 * LANES + lane] += c * m22
-        sums[10 * LANES + lane] += c * m13
-        sums[11 * LANES + lane] += c * m04
+        _add5(sums, 7 * LANES + lane, near + far, m40, m31, m22, m13, m04)
         near, far = near * -companion, far * primary
         m50, m41, m32 = m40 * a, m31 * a, m22 * a
         m23, m14, m05 = m13 * a, m04 * a, m04 * b
-        c = near + far
-        sums[12 * LANES + lane] += c * m50
-        sums[13 * LANES + lane] += c * m41
-        sums[14 * LANES + lane] += c * m32
-        sums[15 * LANES + lane] += c * m23
-        sums[16 * LANES + lane] += c * m14
-        sums[17 * LANES + lane] += c * m05
+        _add3(sums, 12 * LANES + lane, near + far, m50, m41, m32)
+        _add3(sums, 15 * LANES + lane, near + far, m23, m14, m05)
         near, far = near * -companion, far * primary
         m60, m51, m42, m33 = m50 * a, m41 * a, m32 * a, m23 * a
         m24, m15, m06 = m14 * a, m05 * a, m05 * b
-        c = near + far
-        sums[18 * LANES + lane] += c * m60
-        sums[19 * LANES + lane] += c * m51
-        sums[20 * LANES + lane] += c * m42
-        sums[21 * LANES + lane] += c * m33
-        sums[22 * LANES + lane] += c * m24
-        sums[23 * LANES + lane] += c * m15
-        sums[24 * LANES + lane] += c * m06
+        _add4(sums, 18 * LANES + lane, near + far, m60, m51, m42, m33)
+        _add3(sums, 22 * LANES + lane, near + far, m24, m15, m06)
         near, far = near * -companion, far * primary
         m70, m61, m52, m43 = m60 * a, m51 * a, m42 * a, m33 * a
         m34, m25, m16, m07 = m24 * a, m15 * a, m06 * a, m06 * b
-        c = near + far
-        sums[25 * LANES + lane] += c * m70
-        sums[26 * LANES + lane] += c * m61
-        sums[27 * LANES + lane] += c * m52
-        sums[28 * LANES + lane] += c * m43
-        sums[29 * LANES + lane] += c * m34
-        sums[30 * LANES + lane] += c * m25
-        sums[31 * LANES + lane] += c * m16
-        sums[32 * LANES + lane] += c * m07
+        _add4(sums, 25 * LANES + lane, near + far, m70, m61, m52, m43)
+        _add4(sums, 29 * LANES + lane, near + far, m34, m25, m16, m07)
         near, far = near * -companion, far * primary
         m80, m71, m62, m53, m44 = m70 * a, m61 * a, m52 * a, m43 * a, m34 * a
         m35, m26, m17, m08 = m25 * a, m16 * a, m07 * a, m07 * b
-        c = near + far
-        sums[33 * LANES + lane] += c * m80
-        sums[34 * LANES + lane] += c * m71
-        sums[35 * LANES + lane] += c * m62
-        sums[36 * LANES + lane] += c * m53
-        sums[37 * LANES + lane] += c * m44
-        sums[38 * LANES + lane] += c * m35
-        sums[39 * LANES + lane] += c * m26
-        sums[40 * LANES + lane] += c * m17
-        sums[41 * LANES + lane] += c * m08
+        _add5(sums, 33 * LANES + lane, near + far, m80, m71, m62, m53, m44)
+        _add4(sums, 38 * LANES + lane, near + far, m35, m26, m17, m08)
     # fmt: on
 
 
