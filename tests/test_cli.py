@@ -111,6 +111,28 @@ def test_measure_by_response_and_by_images(porrima, tmp_path, estimator):
         assert abs(results["response"][name] - results["images"][name]) < 1e-4 * results["images"]["dr2_rel"]
 
 
+def test_response_has_the_keys_of_the_contract(porrima):
+    code, out, _ = porrima("response", "--psf", "psf1", "--json")
+    result = json.loads(out)
+    assert code == 0
+    assert set(result) >= {"r2_0", "e1_0", "e2_0", "kappa_r2", "de1_deta", "de2_deta", "derivatives"}
+    assert result["kappa_r2"] == pytest.approx(1)
+    assert set(result["derivatives"][0]) == {"moment", "order", "de1", "de2", "dr2"}
+    code, out, _ = porrima("response", "--psf", "psf1", "--psf", "psf0", "--estimator", "plain", "--json")
+    assert [(r["psf"], r["estimator"]) for r in json.loads(out)["responses"]] == [
+        ("psf1", "plain"),
+        ("psf0", "plain"),
+    ]
+
+
+def test_toy_writes_its_figure(porrima, tmp_path):
+    code, out, _ = porrima("toy", "-o", tmp_path / "toy", "--points", 5, "--json")
+    result = json.loads(out)
+    assert code == 0
+    assert (tmp_path / "toy" / "toy.png").exists()
+    assert [c["delta_m"] for c in result["contrasts"]] == [0, 1]
+
+
 def test_predict_has_the_keys_of_the_contract(porrima, stars_file):
     code, out, _ = porrima("predict", "--stars", stars_file, "--mag", 18, 19, "--psf", "psf1", "--json")
     result = json.loads(out)
@@ -232,6 +254,10 @@ WRONG = [  # arguments, what the one line says
     (["simulate", "{impossible}", "-o", "run.zarr"], "binary_fraction: must be in [0, 1], uniform or model, got 1.2"),
     (["simulate", "{none}", "-o", "run.zarr"], "n_stars: must be greater than or equal to 1, got 0"),
     (["simulate", "{unknown_psf}", "-o", "run.zarr"], "psf: must be one of psf0, psf1, psf2"),
+    (["response", "--psf", "psf9"], "psf: must be one of psf0, psf1, psf2"),
+    (["response", "--psf", "psf0", "--estimator", "plain:x"], "R of plain:R must be a number of arcsec"),
+    (["toy", "-o", "{stars}"], "output: cannot be made"),
+    (["toy", "-o", "toy", "--ellipticity", "1"], "--ellipticity: must be between 0 and 1, got 1"),
     (["summary", "absent.zarr"], "absent.zarr: is not a run of porrima simulate"),
     (["summary", "{config}"], "is not a run of porrima simulate"),
     (["paper", "-o", "{stars}"], "output: cannot be made"),
@@ -282,7 +308,9 @@ def test_help_needs_nothing_heavy():
     assert not {"numpy", "numba", "galsim", "astropy", "xarray", "matplotlib"} & set(modules)
 
 
-@pytest.mark.parametrize("command", ["stars", "measure", "predict", "simulate", "summary", "paper", "bench"])
+@pytest.mark.parametrize(
+    "command", ["stars", "measure", "response", "toy", "predict", "simulate", "summary", "paper", "bench"]
+)
 def test_every_command_has_help_and_json(porrima, command):
     code, out, _ = porrima(command, "--help")
     assert code == 0

@@ -137,7 +137,7 @@ def test_a_pixel_is_what_galsim_convolves_with():
         ours = psf_from_name(name, pixel=0.1)
         expected = ours.draw(exact)
         np.testing.assert_allclose(
-            ours.draw().array, expected.array, rtol=0, atol=1e-7 * expected.array.max()
+            ours.draw().array, expected.array, rtol=0, atol=5e-7 * expected.array.max()
         )
         assert ours.name == f"{name}, pixel 0.1"
 
@@ -147,8 +147,8 @@ def test_jitter_and_diffusion_add_in_quadrature_to_a_gaussian():
     q = psf_from_name("psf1").profile.original.sigma ** 2
     scale = q / np.sqrt(1 - 0.054**2 - 0.003**2)
     expected = 2 * scale + 2 * 0.05**2
-    assert r2 == pytest.approx(expected, rel=1e-8)
-    assert (e1, e2) == pytest.approx((0.054 * 2 * scale / expected, -0.003 * 2 * scale / expected), abs=1e-8)
+    assert r2 == pytest.approx(expected, rel=5e-7)
+    assert (e1, e2) == pytest.approx((0.054 * 2 * scale / expected, -0.003 * 2 * scale / expected), abs=5e-8)
 
 
 @pytest.mark.parametrize("name", ["optical0", "roman:H158:SCA01"])

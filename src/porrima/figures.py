@@ -358,6 +358,7 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
     """
     groups = list(dict.fromkeys(row["group"] for row in rows))
     estimators = list(dict.fromkeys(row["kind"] for row in rows))
+    mixed = {g for g in groups if len({row["kind"] for row in rows if row["group"] == g}) > 1}
     with rc_context(_STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(max(4.5, 0.42 * len(groups) + 1.4), 6.2), layout="constrained")
         axes = figure.subplots(2, 1, sharex=True)
@@ -366,10 +367,10 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
             ("kappa_e", axes[1], r"ellipticity: $-\delta\mathbf{e}\cdot\mathbf{e}_0 / (e_0^2\, \eta)$"),
         ):
             for k, estimator in enumerate(estimators):
-                shift = 0.22 * (k - 0.5 * (len(estimators) - 1))
                 here = [r for r in rows if r["kind"] == estimator and r[name] is not None]
+                shift = 0.22 * (k - 0.5 * (len(estimators) - 1))
                 axis.plot(
-                    [groups.index(r["group"]) + shift for r in here],
+                    [groups.index(r["group"]) + (shift if r["group"] in mixed else 0.0) for r in here],
                     [r[name] for r in here],
                     linestyle="none", marker=_MARKERS[k], color=_COLOURS[k], markersize=4.0, alpha=0.8, label=estimator,
                 )  # fmt: skip
@@ -381,5 +382,8 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
         axes[1].set_xticks(range(len(groups)), groups, rotation=48, ha="right", rotation_mode="anchor")
         axes[1].tick_params(axis="x", which="both", top=False, length=0)
         axes[1].set_xlim(-0.6, len(groups) - 0.4)
-        axes[0].legend(loc="upper left", frameon=False, fontsize=8.5, ncols=len(estimators))
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(
+            handles, labels, loc="outside upper center", frameon=False, fontsize=8.5, ncols=len(estimators)
+        )
     return figure

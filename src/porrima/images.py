@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import galsim
 import numpy as np
 
+from porrima.reach import settled, stamp_reach
+
 if TYPE_CHECKING:
     from porrima.psf import PSF
     from porrima.shapes import Estimator, Shape
@@ -15,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["draw_stack", "measure_stack"]
 
 
-def draw_stack(psf: PSF, systems: Systems) -> Any:
+def draw_stack(psf: PSF, systems: Systems, reach: float = 0.0) -> Any:
     """Image of a stack of systems, each centred on its own flux centroid.
 
     Parameters
@@ -24,6 +26,8 @@ def draw_stack(psf: PSF, systems: Systems) -> Any:
         Drawn once for every source.
     systems : Systems
         The stars of the stack and their weights.
+    reach : float
+        Least half width of the stamp of the PSF alone, in arcsec.
 
     Returns
     -------
@@ -40,7 +44,7 @@ def draw_stack(psf: PSF, systems: Systems) -> Any:
     unique, which = np.unique(places, axis=0, return_inverse=True)
     flux = np.bincount(which.ravel(), weights=share[share > 0])
     sources = [psf.profile.shift(x, y) * f for (x, y), f in zip(unique.tolist(), flux.tolist(), strict=True)]
-    return psf.draw(galsim.Sum(sources), margin=float(np.abs(unique).max()))
+    return psf.draw(galsim.Sum(sources), margin=float(np.abs(unique).max()), reach=reach)
 
 
 def measure_stack(psf: PSF, systems: Systems, estimator: Estimator) -> Shape:
@@ -53,7 +57,7 @@ def measure_stack(psf: PSF, systems: Systems, estimator: Estimator) -> Shape:
     systems : Systems
         The stars of the stack and their weights.
     estimator : Estimator
-        How it is measured.
+        How it is measured: plain moments that diverge, as `settled` says.
 
     Returns
     -------
@@ -68,4 +72,5 @@ def measure_stack(psf: PSF, systems: Systems, estimator: Estimator) -> Shape:
     ----------
     Rowe2015, Hirata2003
     """
-    return estimator.measure(draw_stack(psf, systems))
+    estimator = settled(estimator, psf)
+    return estimator.measure(draw_stack(psf, systems, stamp_reach(estimator, psf)))

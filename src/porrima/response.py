@@ -15,16 +15,22 @@ derivatives of the measurement are sums of J as well.  The J of one PSF are comp
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING
+import sys
+from dataclasses import asdict, dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numba import njit, prange
 
+from porrima import __version__, aperture, moments, shapes, stamps, weighted
+from porrima.aperture import AperturePSF, aperture_covariance
+from porrima.cache import content_key, load, save
 from porrima.moments import INDICES, N_MOMENTS, ORDER
+from porrima.reach import settled, stamp_reach
 from porrima.shapes import Adaptive, Failure, GaussianWeight, Plain, Shape
-from porrima.weighted import Derivatives, WeightedPSF, covariance_derivatives, exact_covariance, weighted_psf
+from porrima.weighted import Derivatives, WeightedPSF, exact_covariance
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -101,7 +107,7 @@ class Response:
     second : (3, n_moment, n_moment) float array
         :math:`\partial^2 s / \partial m_{ab} \partial m_{cd}`, symmetric, in arcsec^-(a+b+c+d), times
         arcsec² for r2.
-    weighted : WeightedPSF or None
+    weighted : WeightedPSF, AperturePSF or None
         For the exact solution; None where the measurement has no weight.
 
     References
@@ -114,7 +120,7 @@ class Response:
     shape0: Shape
     first: FloatArray
     second: FloatArray
-    weighted: WeightedPSF | None
+    weighted: WeightedPSF | AperturePSF | None
 
     @property
     def kappa_r2(self) -> float:
@@ -179,7 +185,8 @@ class Response:
         highest = slice(N_MOMENTS - ORDER - 1, N_MOMENTS)
         tail = np.einsum("ni,i->n", values[:, highest], self.first[2, highest])
         size = values[:, _XX] + values[:, _YY]
-        grown = (self.weighted.fixed == 0) & (np.abs(change[:, 2]) > GROWTH_LIMIT * self.shape0.r2)
+        adapts = isinstance(self.weighted, WeightedPSF) and self.weighted.fixed == 0
+        grown = adapts & (np.abs(change[:, 2]) > GROWTH_LIMIT * self.shape0.r2)
         flag[grown | (np.abs(tail) > SERIES_LIMIT * np.abs(size))] |= Failure.SERIES
         relative = np.abs(change) / np.array([1.0, 1.0, self.shape0.r2])
         shape = Shape(
@@ -191,9 +198,15 @@ class Response:
         covariance = shape.covariance()
         large = (relative.max(axis=1) > threshold) & (flag == 0)
         if large.any():
-            covariance[large] = exact_covariance(self.weighted, values[large], covariance[large])
+            covariance[large] = self._exact(values[large], covariance[large])
             flag[large] = np.where(np.isfinite(covariance[large, 0]), 0, int(Failure.NOT_CONVERGED))
         return Shape.from_covariance(covariance, flag)
+
+    def _exact(self, values: FloatArray, guess: FloatArray) -> FloatArray:
+        """Measured second moments of stacks from the equations of the measurement themselves."""
+        if isinstance(self.weighted, AperturePSF):
+            return aperture_covariance(self.weighted, values)
+        return exact_covariance(cast("WeightedPSF", self.weighted), values, guess)
 
 
 def _shape_derivatives(covariance: FloatArray) -> Derivatives:
@@ -210,22 +223,6 @@ def _shape_derivatives(covariance: FloatArray) -> Derivatives:
     return Derivatives(first=first, second=second)
 
 
-def _unweighted(psf: PSF, estimator: Estimator) -> Response:
-    """Response of plain moments: Q = Q0 + m2, from the image of the PSF alone."""
-    shape0 = estimator.measure(psf.draw())
-    by_moment = np.zeros((3, N_MOMENTS))
-    by_moment[[0, 1, 2], [_XX, _XY, _YY]] = 1.0
-    outer = _shape_derivatives(shape0.covariance())
-    return Response(
-        psf=psf.name,
-        estimator=estimator.name,
-        shape0=shape0,
-        first=outer.first @ by_moment,
-        second=np.einsum("kij,im,jn->kmn", outer.second, by_moment, by_moment, optimize=True),
-        weighted=None,
-    )
-
-
 def response(psf: PSF, estimator: Estimator) -> Response:
     """Response of an estimator behind a PSF.
 
@@ -234,12 +231,13 @@ def response(psf: PSF, estimator: Estimator) -> Response:
     psf : PSF
         Any PSF: only its image, drawn once, enters.
     estimator : Estimator
-        `Plain`, `Adaptive` or `GaussianWeight`.
+        `Plain`, `Adaptive` or `GaussianWeight`; plain moments that diverge are taken within an aperture
+        (`shapes.settled`).
 
     Returns
     -------
     response : Response
-        Kept, so that the same question is answered at once.
+        Kept, so that the same question is answered at once, in memory and on disk.
 
     Raises
     ------
@@ -247,30 +245,79 @@ def response(psf: PSF, estimator: Estimator) -> Response:
         If the estimator is none of the three.
     ValueError
         If the PSF has no fixed point under the weight.
+
+    Notes
+    -----
+    On disk (`cache`) the name of a response is a hash of the PSF's pixels, the estimator and the code that
+    made it.
     """
     return _response(psf, estimator)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=128)
 def _response(psf: PSF, estimator: Estimator) -> Response:
     """What `response` keeps."""
-    if isinstance(estimator, Plain):
-        return _unweighted(psf, estimator)
-    if not isinstance(estimator, Adaptive | GaussianWeight):
+    if not isinstance(estimator, Plain | Adaptive | GaussianWeight):
         raise TypeError(
             f"estimator must be Plain, Adaptive or GaussianWeight, got {type(estimator).__name__}"
         )
-    weighted = weighted_psf(psf, estimator.sigma if isinstance(estimator, GaussianWeight) else 0.0)
-    inner, outer = covariance_derivatives(weighted), _shape_derivatives(weighted.covariance)
-    second = np.einsum("kij,im,jn->kmn", outer.second, inner.first, inner.first, optimize=True)
-    second += np.einsum("ki,imn->kmn", outer.first, inner.second)
-    arcsec = weighted.unit ** -np.sum(INDICES, axis=1, dtype=float)  # from powers of unit to powers of arcsec
-    size = np.array([1.0, 1.0, weighted.unit**2])
+    estimator = settled(estimator, psf)
+    image = psf.draw(reach=stamp_reach(estimator, psf))
+    key = content_key(image.array, float(image.scale), estimator.name, _code_version())
+    known = load(key)
+    if known is None:
+        try:
+            known = _arrays(image, estimator)
+        except ValueError as error:
+            raise ValueError(f"{psf.name}: {error}") from None
+        save(key, known)
+    shape0 = Shape.from_covariance(known.pop("covariance0"), int(known.pop("flag0")))
+    first, second = known.pop("first"), known.pop("second")
+    kind: type[WeightedPSF | AperturePSF] = WeightedPSF if "fixed" in known else AperturePSF
+    fields: dict[str, Any] = {k: float(v) if k in ("unit", "fixed") else v for k, v in known.items()}
     return Response(
         psf=psf.name,
         estimator=estimator.name,
-        shape0=Shape.from_covariance(weighted.covariance * weighted.unit**2),
-        first=outer.first @ inner.first * arcsec * size[:, None],
-        second=second * np.outer(arcsec, arcsec) * size[:, None, None],
-        weighted=weighted,
+        shape0=shape0,
+        first=first,
+        second=second,
+        weighted=kind(**fields) if fields else None,
     )
+
+
+@cache
+def _code_version() -> str:
+    """Hash of the modules that a response is made with."""
+    modules = aperture, moments, shapes, stamps, weighted, sys.modules[__name__]
+    return content_key(__version__, *(Path(str(module.__file__)).read_bytes() for module in modules))
+
+
+def _arrays(image: Any, estimator: Any) -> dict[str, Any]:
+    """A response as arrays: shape without companions, derivatives, and the fields of its `weighted`."""
+    if isinstance(estimator, Plain) and estimator.aperture is None:
+        found = estimator.measure(image)
+        inner = Derivatives(first=np.zeros((3, N_MOMENTS)), second=np.zeros((3, N_MOMENTS, N_MOMENTS)))
+        inner.first[[0, 1, 2], [_XX, _XY, _YY]] = 1.0  # Q = Q0 + m2
+        parts: dict[str, Any] = {}
+        covariance, unit, flag = found.covariance(), 1.0, int(found.flag)
+    else:
+        about: WeightedPSF | AperturePSF
+        if isinstance(estimator, Plain):
+            about = aperture.aperture_psf(image, estimator)
+            inner = aperture.aperture_derivatives(about)
+        else:
+            about = weighted.weighted_psf(image, estimator)
+            inner = weighted.covariance_derivatives(about)
+        parts = asdict(about)
+        covariance, unit, flag = about.covariance, about.unit, 0
+    outer = _shape_derivatives(covariance)
+    second = np.einsum("kij,im,jn->kmn", outer.second, inner.first, inner.first, optimize=True)
+    second += np.einsum("ki,imn->kmn", outer.first, inner.second)
+    arcsec = unit ** -np.sum(INDICES, axis=1, dtype=float)  # from powers of unit to powers of arcsec
+    size = np.array([1.0, 1.0, unit**2])
+    return parts | {
+        "covariance0": covariance * unit**2,
+        "flag0": flag,
+        "first": outer.first @ inner.first * arcsec * size[:, None],
+        "second": second * np.outer(arcsec, arcsec) * size[:, None, None],
+    }

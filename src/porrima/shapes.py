@@ -18,7 +18,15 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
-__all__ = ["Adaptive", "Estimator", "Failure", "GaussianWeight", "Plain", "Shape", "estimator_from_name"]
+__all__ = [
+    "Adaptive",
+    "Estimator",
+    "Failure",
+    "GaussianWeight",
+    "Plain",
+    "Shape",
+    "estimator_from_name",
+]
 
 PRECISION = 1e-10
 """Tolerance of HSM's iteration, as a fraction of the size (dimensionless)."""
@@ -31,6 +39,12 @@ POLISH_TOLERANCE = 1e-12
 """Change of the weight, as a fraction of its size, at which an iteration in float64 stops (dimensionless)."""
 
 MAX_ITERATIONS = 200
+
+APERTURE_EDGE = 0.025
+"""Sigma by which the edge of an aperture is blurred, in arcsec: three pixels of the coarsest grid."""
+
+APERTURE_MIN = 0.1
+"""Smallest radius of an aperture, in arcsec: four times the blur of its edge."""
 
 SIGMA_MIN = 0.02
 """Narrowest fixed weight, in arcsec: 2.4 pixels of the coarsest grid: pixel sums are still integrals."""
@@ -116,6 +130,11 @@ class Estimator(Protocol):
         """As the option ``--estimator`` takes it."""
         ...
 
+    @property
+    def reach(self) -> float:
+        """Half width of the stamp beyond which nothing counts, in arcsec; 0: that of the PSF."""
+        ...
+
     def measure(self, image: Any) -> Shape:
         """Shape of one image, as a `Shape` of 0-d arrays."""
         ...
@@ -170,22 +189,70 @@ def _pixels_failure(image: Any) -> Failure:
 
 @dataclass(frozen=True, slots=True)
 class Plain:
-    r"""Unweighted moments, summed over the pixels of the whole stamp.
+    r"""Unweighted moments, of the whole stamp or within a round aperture.
+
+    Parameters
+    ----------
+    aperture : float, optional
+        Radius of the aperture, at least `APERTURE_MIN`, in arcsec; the whole stamp where not given.
+
+    Raises
+    ------
+    ValueError
+        If the aperture is not finite or below `APERTURE_MIN`.
 
     Notes
     -----
-    :math:`Q_{ij} = \sum I (x_i - \bar x_i)(x_j - \bar x_j) / \sum I`.  Exact for a profile whose wings
-    end inside the stamp, as those of a Gaussian do; for others the stamp is the aperture.
+    :math:`Q_{ij} = \sum w I y_i y_j / \sum w I` with :math:`y = x - x_0`, and :math:`x_0` where
+    :math:`\sum w I y = 0`.  Without an aperture w = 1, exact for a profile whose wings end inside the stamp,
+    as those of a Gaussian do.  The moments of other PSFs diverge: for them :math:`w = \frac12
+    \mathrm{erfc}[(|y| - \mathrm{radius}) / (\sqrt2 s)]`, a step blurred by s = `APERTURE_EDGE`, so that sums
+    over pixels are integrals.
 
     References
     ----------
     KCM16, Sect. 3
     """
 
+    aperture: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.aperture is not None and not (math.isfinite(self.aperture) and self.aperture >= APERTURE_MIN):
+            raise ValueError(
+                f"aperture must be finite and at least {APERTURE_MIN} arcsec, got {self.aperture}"
+            )
+
     @property
     def name(self) -> str:
-        """Always ``plain``."""
-        return "plain"
+        """``plain``, with the radius of an aperture, such as ``plain:0.75``."""
+        return "plain" if self.aperture is None else f"plain:{self.aperture!r}"
+
+    @property
+    def reach(self) -> float:
+        """Half width of the stamp beyond which nothing counts, in arcsec; 0: that of the PSF."""
+        return 0.0 if self.aperture is None else self.aperture + 8 * APERTURE_EDGE
+
+    def weight(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Weight of pixels.
+
+        Parameters
+        ----------
+        x : (nx,) float array
+            Of the columns, from the centre of the aperture, in arcsec.
+        y : (ny,) float array
+            Of the rows, likewise.
+
+        Returns
+        -------
+        weight : (ny, nx) float array
+            In [0, 1].
+        """
+        from scipy.special import erfc  # noqa: PLC0415  (a tenth of a second, for apertures only)
+
+        if self.aperture is None:
+            return np.ones((len(y), len(x)))
+        beyond = np.hypot(y[:, None], x) - self.aperture
+        return np.asarray(0.5 * erfc(beyond / (math.sqrt(2) * APERTURE_EDGE)))
 
     def measure(self, image: Any) -> Shape:
         """Shape of one image from unweighted moments.
@@ -204,7 +271,20 @@ class Plain:
         if failure:
             return _failed(failure)
         moments = _weighted_moments(image, np.zeros(2), None)
-        return _shape(moments.covariance - np.outer(moments.offset, moments.offset))
+        if self.aperture is None:
+            return _shape(moments.covariance - np.outer(moments.offset, moments.offset))
+        ny, nx = image.array.shape
+        x, y = ((np.arange(n) - (n - 1) / 2) * image.scale for n in (nx, ny))
+        centre, inside = np.zeros(2), image.copy()
+        for _ in range(MAX_ITERATIONS):
+            inside.array[:] = image.array * self.weight(x - centre[0], y - centre[1])
+            moments = _weighted_moments(inside, centre, None)
+            if not moments.flux > 0:
+                return _failed(Failure.NO_FLUX)
+            centre = centre + moments.offset
+            if np.abs(moments.offset).max() < POLISH_TOLERANCE * self.aperture:
+                return _shape(moments.covariance)
+        return _failed(Failure.NOT_CONVERGED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,6 +309,11 @@ class Adaptive:
     def name(self) -> str:
         """Always ``adaptive``."""
         return "adaptive"
+
+    @property
+    def reach(self) -> float:
+        """Always 0: the weight is as narrow as the PSF."""
+        return 0.0
 
     def measure(self, image: Any) -> Shape:
         """Shape of one image from adaptive moments.
@@ -310,6 +395,11 @@ class GaussianWeight:
         """The name with the sigma, such as ``gaussian:0.75``."""
         return f"gaussian:{self.sigma!r}"
 
+    @property
+    def reach(self) -> float:
+        """Seven sigmas, where the weight is 2e-11, in arcsec."""
+        return 7 * self.sigma
+
     def measure(self, image: Any) -> Shape:
         """Shape of one image from moments under the fixed weight.
 
@@ -333,11 +423,11 @@ class GaussianWeight:
             if not moments.flux > 0:
                 return _failed(Failure.NO_FLUX)
             slope = np.eye(2) - moments.covariance / self.sigma**2
-            if not (np.trace(slope) > 0 and np.linalg.det(slope) > 0):
-                break  # between two sources: the centroid would run away from the centre
+            stable = np.trace(slope) > 0 and np.linalg.det(slope) > 0
             if np.abs(moments.offset).max() < POLISH_TOLERANCE * self.sigma:
-                return _shape(moments.covariance)
-            centre = centre + np.linalg.solve(slope, moments.offset)
+                return _shape(moments.covariance) if stable else _failed(Failure.NOT_CONVERGED)
+            # Between two sources only the plain step, towards the brighter one, is to be trusted.
+            centre = centre + (np.linalg.solve(slope, moments.offset) if stable else moments.offset)
         return _failed(Failure.NOT_CONVERGED)
 
 
@@ -351,7 +441,8 @@ def estimator_from_name(name: str) -> Estimator:
     Parameters
     ----------
     name : str
-        ``adaptive``, ``plain`` or ``gaussian:S`` with S the sigma of the weight in arcsec.
+        ``adaptive``, ``plain``, ``plain:R`` with R the radius of an aperture in arcsec, or ``gaussian:S`` with
+        S the sigma of the weight in arcsec.
 
     Returns
     -------
@@ -361,15 +452,16 @@ def estimator_from_name(name: str) -> Estimator:
     Raises
     ------
     InputError
-        If no estimator has that name, or S is no number or too small.
+        If no estimator has that name, or R or S is no number or too small.
     """
     if name in ESTIMATORS:
         return ESTIMATORS[name]
     kind, colon, number = name.partition(":")
-    if kind != "gaussian" or not colon:
-        raise InputError("must be one of adaptive, plain, gaussian:S", key="estimator", value=name)
+    if kind not in ("plain", "gaussian") or not colon:
+        raise InputError("must be one of adaptive, plain, plain:R, gaussian:S", key="estimator", value=name)
     try:
-        return GaussianWeight(float(number))
+        return GaussianWeight(float(number)) if kind == "gaussian" else Plain(float(number))
     except ValueError:
-        rule = f"S of gaussian:S must be a number of arcsec, at least {SIGMA_MIN}"
+        letter, least = ("S", SIGMA_MIN) if kind == "gaussian" else ("R", APERTURE_MIN)
+        rule = f"{letter} of {kind}:{letter} must be a number of arcsec, at least {least}"
         raise InputError(rule, key="estimator", value=name) from None

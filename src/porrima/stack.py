@@ -113,7 +113,9 @@ def draw_stacks(
     unit = np.array([population.cut ** (a + b) for a, b in INDICES])
     _fill(_tables(population), np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
     if np.any(np.isnan(sums[:, 0])):
-        raise ValueError(f"cut must leave some pairs unresolved at this binary fraction, got {population.cut}")
+        raise ValueError(
+            f"cut must leave some pairs unresolved at this binary fraction, got {population.cut}"
+        )
     return Stacks(binary_fraction=fractions, moments=KernelMoments(values=sums, n_stars=n_stars))
 
 

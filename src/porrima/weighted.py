@@ -13,18 +13,34 @@ import numpy as np
 from numba import njit, prange
 
 from porrima.moments import INDICES, ORDER
+from porrima.shapes import GaussianWeight
+from porrima.stamps import measure_stamps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from porrima.psf import PSF
+    from porrima.shapes import Adaptive
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["Derivatives", "WeightedPSF", "covariance_derivatives", "exact_covariance", "weighted_psf"]
+__all__ = [
+    "Derivatives",
+    "WeightedPSF",
+    "covariance_derivatives",
+    "exact_covariance",
+    "half_light_radius",
+    "implicit_derivatives",
+    "weighted_psf",
+]
 
 EXACT_ORDER = 20
 """Degree at which the exact solution cuts the effective kernel: 3e-8 of the size change of a worst pair."""
+
+FIXED_ORDER = ORDER + 4
+"""The same for a fixed weight, which does not grow: only the small shift of its centre adds to the kernel."""
+
+FARTHEST = 80.0
+"""Exponent of the weight beyond which pixels do not count: 12.6 sigmas, 1e-9 of the integrals of order 24."""
 
 MAX_STEPS = 100
 """Newton steps in search of the fixed point of a PSF (count)."""
@@ -34,38 +50,49 @@ _FACTORIALS = np.array([float(factorial(a) * factorial(b)) for a, b in INDICES])
 
 
 @njit(cache=True)
-def _weight_integrals(pixels, step, centre, covariance, order):  # type: ignore[no-untyped-def]
-    """Integrals J[a, b], a + b <= order, as sums over pixels of side `step` from the middle of the stamp.
+def _row_integrals(pixels, y, x0, step, precision, norm, order, integrals, h):  # type: ignore[no-untyped-def]
+    """Add a row's share of the integrals: its pixels times H_ab W, a + b <= order.
 
     (d/dx)^a (d/dy)^b W = (-1)^(a+b) H_ab W, with H_{a+1,b} = y1 H_ab - a P11 H_{a-1,b} - b P12 H_{a,b-1}
     for P = M^-1 and y = P (x - x0).
     """
-    det = covariance[0] * covariance[2] - covariance[1] ** 2
-    p11, p12, p22 = covariance[2] / det, -covariance[1] / det, covariance[0] / det
-    norm = step * step / (2 * np.pi * np.sqrt(det))
-    integrals = np.zeros((order + 1, order + 1))
-    h = np.zeros((order + 1, order + 1))
-    for row in range(pixels.shape[0]):
-        dy = (row - 0.5 * (pixels.shape[0] - 1)) * step - centre[1]
-        for column in range(pixels.shape[1]):
-            dx = (column - 0.5 * (pixels.shape[1] - 1)) * step - centre[0]
-            y1, y2 = p11 * dx + p12 * dy, p12 * dx + p22 * dy
-            exponent = 0.5 * (dx * y1 + dy * y2)
-            if exponent > 300.0 or pixels[row, column] == 0.0:
-                continue
-            h[0, 0] = norm * np.exp(-exponent) * pixels[row, column]
-            for b in range(order + 1):
+    p11, p12, p22 = precision
+    for column in range(pixels.shape[0]):
+        x = (column - 0.5 * (pixels.shape[0] - 1)) * step - x0
+        y1, y2 = p11 * x + p12 * y, p12 * x + p22 * y
+        exponent = 0.5 * (x * y1 + y * y2)
+        if exponent > FARTHEST or pixels[column] == 0.0:
+            continue
+        h[0, 0] = norm * np.exp(-exponent) * pixels[column]
+        for b in range(order + 1):
+            if b > 0:
+                h[0, b] = y2 * h[0, b - 1] - ((b - 1) * p22 * h[0, b - 2] if b > 1 else 0.0)
+            for a in range(order - b):
+                value = y1 * h[a, b]
+                if a > 0:
+                    value -= a * p11 * h[a - 1, b]
                 if b > 0:
-                    h[0, b] = y2 * h[0, b - 1] - ((b - 1) * p22 * h[0, b - 2] if b > 1 else 0.0)
-                for a in range(order - b):
-                    value = y1 * h[a, b]
-                    if a > 0:
-                        value -= a * p11 * h[a - 1, b]
-                    if b > 0:
-                        value -= b * p12 * h[a, b - 1]
-                    h[a + 1, b] = value
-                for a in range(order + 1 - b):
-                    integrals[a, b] += h[a, b]
+                    value -= b * p12 * h[a, b - 1]
+                h[a + 1, b] = value
+            for a in range(order + 1 - b):
+                integrals[a, b] += h[a, b]
+
+
+@njit(cache=True, parallel=True)
+def _weight_integrals(pixels, step, centre, covariance, order):  # type: ignore[no-untyped-def]
+    """Integrals J[a, b], a + b <= order, as sums over pixels of side `step` from the middle of the stamp."""
+    det = covariance[0] * covariance[2] - covariance[1] ** 2
+    precision = (covariance[2] / det, -covariance[1] / det, covariance[0] / det)
+    norm = step * step / (2 * np.pi * np.sqrt(det))
+    rows = np.zeros((pixels.shape[0], order + 1, order + 1))  # added in their order, whatever the threads
+    for row in prange(pixels.shape[0]):
+        y = (row - 0.5 * (pixels.shape[0] - 1)) * step - centre[1]
+        if 0.5 * y * y / covariance[2] < FARTHEST:
+            h = np.zeros((order + 1, order + 1))
+            _row_integrals(pixels[row], y, centre[0], step, precision, norm, order, rows[row], h)
+    integrals = np.zeros((order + 1, order + 1))
+    for row in range(pixels.shape[0]):
+        integrals += rows[row]
     for a in range(order + 1):
         for b in range(order + 1 - a):
             integrals[a, b] *= (-1.0) ** (a + b)
@@ -260,25 +287,42 @@ class Derivatives:
     second: FloatArray
 
 
-def weighted_psf(psf: PSF, fixed_sigma: float = 0.0) -> WeightedPSF:
+def half_light_radius(image: Any) -> float:
+    """Radius of the disc with as many pixels as are brighter than half the maximum.
+
+    Parameters
+    ----------
+    image : galsim.Image
+        With its scale in arcsec.
+
+    Returns
+    -------
+    radius : float
+        Half the FWHM of a round PSF, in arcsec.
+    """
+    pixels = image.array
+    return float(np.sqrt((pixels >= 0.5 * pixels.max()).sum() / np.pi) * image.scale)
+
+
+def weighted_psf(image: Any, estimator: Adaptive | GaussianWeight) -> WeightedPSF:
     """Fixed point of a PSF under a Gaussian weight, and the integrals that belong to it.
 
     Parameters
     ----------
-    psf : PSF
-        Drawn once.
-    fixed_sigma : float
-        Sigma of a fixed weight, which only its centre must fit, in arcsec; 0 for the adaptive weight.
+    image : galsim.Image
+        Of the PSF, with its scale in arcsec.
+    estimator : Adaptive or GaussianWeight
+        A fixed weight need only find its centre.
 
     Returns
     -------
     weighted : WeightedPSF
-        Found by damped Newton steps on sums over pixels, to 1e-13.
+        Where `stamps` measures the image, found to 1e-14 by Newton steps on sums over pixels.
 
     Raises
     ------
     ValueError
-        If there is no fixed point.
+        If there is no stable fixed point.
 
     Notes
     -----
@@ -289,37 +333,31 @@ def weighted_psf(psf: PSF, fixed_sigma: float = 0.0) -> WeightedPSF:
     ----------
     Hirata2003
     """
-    image = psf.draw()
-    unit = psf.fwhm / 2
+    unit = half_light_radius(image)
+    found = measure_stamps(image.array[None], image.scale, estimator)
+    if found.shape.flag[0]:
+        raise ValueError(f"psf must have a stable fixed point under its weight, got none by {estimator.name}")
     pixels, step = np.ascontiguousarray(image.array), image.scale / unit
-    fixed = (unit / fixed_sigma) ** 2 if fixed_sigma > 0 else 0.0
-    centre, q = np.zeros(2), np.array([0.72, 0.0, 0.72])  # a Gaussian of that FWHM, in units of (FWHM/2)²
+    fixed = (unit / estimator.sigma) ** 2 if isinstance(estimator, GaussianWeight) else 0.0
+    centre, q = np.array([found.x[0], found.y[0]]) / unit, found.shape.covariance()[0] / unit**2
     for _ in range(MAX_STEPS):
         weight = np.array([1.0, 0.0, 1.0]) / fixed if fixed > 0 else q
         integrals = _weight_integrals(pixels, step, centre, weight, 4)
         system = _linearised(integrals / integrals[0, 0], q, fixed)
         move = -np.linalg.solve(system[:, 1:], system[:, 0])
-        size2 = q[0] + q[2]
-        # As in HSM, no step may be longer than a quarter of the size; the equations of a fixed weight are
-        # linear in Q, so there only the centre can go astray.
-        longest = np.abs(move[:2]).max() / np.sqrt(size2)
-        if fixed == 0:
-            longest = max(longest, np.abs(move[2:]).max() / size2)
-        move *= min(1.0, 0.25 / longest) if longest > 0 else 1.0
         centre, q = centre + move[:2], q + move[2:]
-        if longest < 1e-13:
+        if np.abs(move).max() < 1e-9 * (q[0] + q[2]):  # Newton squares the error
             break
-    # Between two sources a fixed weight of 1/`fixed` is in balance, but the balance is not stable.
-    slope = np.eye(2) - fixed * q[[0, 1, 1, 2]].reshape(2, 2)
-    if not (longest < 1e-13 and np.trace(slope) > 0 and np.linalg.det(slope) > 0):
-        raise ValueError(f"psf must have a stable fixed point under its weight, got {psf.name}")
+    else:
+        raise ValueError(f"psf must have a stable fixed point under its weight, got none by {estimator.name}")
     weight = np.array([1.0, 0.0, 1.0]) / fixed if fixed > 0 else q
-    integrals = _weight_integrals(pixels, step, centre, weight, EXACT_ORDER + 4)
+    order = FIXED_ORDER if fixed > 0 else EXACT_ORDER
+    integrals = _weight_integrals(pixels, step, centre, weight, order + 4)
     return WeightedPSF(unit=unit, covariance=q, fixed=fixed, integrals=integrals / integrals[0, 0])
 
 
 def exact_covariance(
-    weighted: WeightedPSF, values: FloatArray, guess: FloatArray, order: int = EXACT_ORDER
+    weighted: WeightedPSF, values: FloatArray, guess: FloatArray, order: int | None = None
 ) -> FloatArray:
     r"""Measured second moments of stacks: the equations of the measurement solved, not expanded.
 
@@ -331,8 +369,8 @@ def exact_covariance(
         Kernel moments in the order of `moments.INDICES`, in arcsec^(a+b).
     guess : (n, 3) float array
         Q11, Q12, Q22 from which Newton's method starts, in arcsec².
-    order : int
-        Degree at which the effective kernel is cut, at most `EXACT_ORDER`.
+    order : int, optional
+        Degree at which the effective kernel is cut; by default as high as the integrals reach.
 
     Returns
     -------
@@ -356,6 +394,7 @@ def exact_covariance(
     bad = ~((guess[:, 0] + guess[:, 2] > 0) & (guess[:, 0] * guess[:, 2] > guess[:, 1] ** 2))
     start = np.where(bad[:, None], weighted.covariance, guess / weighted.unit**2)
     integrals = weighted.integrals
+    order = len(integrals) - 5 if order is None else order
     solved: FloatArray = _solve(kernels, start, weighted.covariance, weighted.fixed, integrals, order)
     return solved * weighted.unit**2
 
@@ -389,13 +428,38 @@ def covariance_derivatives(weighted: WeightedPSF) -> Derivatives:
         return _linearised(np.ascontiguousarray(j[a : a + 5, b : b + 5]), q, fixed)
 
     by_moment = np.stack([linearised(a, b) / f for (a, b), f in zip(INDICES, _FACTORIALS, strict=True)])
-    inverse = np.linalg.inv(linearised(0, 0)[:, 1:])
-    first = -inverse @ by_moment[:, :, 0].T
     hessian = np.stack([c * linearised(a, b)[:, 1:] for c, a, b in _operators(fixed)], axis=2)
     hessian += _constraint_curvature(j, q, fixed)
-    cross = np.einsum("nki,im->kmn", by_moment[:, :, 1:], first)
+    cross = by_moment[:, :, 1:].transpose(1, 0, 2)
+    return implicit_derivatives(linearised(0, 0)[:, 1:], hessian, by_moment[:, :, 0].T, cross)
+
+
+def implicit_derivatives(
+    gradient: FloatArray, hessian: FloatArray, by_moment: FloatArray, cross: FloatArray
+) -> Derivatives:
+    """Derivatives of (Q11, Q12, Q22) from those of the five equations that define them.
+
+    Parameters
+    ----------
+    gradient : (5, 5) float array
+        Of the equations by the unknowns: the centre (2) and Q (3), dimensionless.
+    hessian : (5, 5, 5) float array
+        Of the equations by the unknowns twice.
+    by_moment : (5, n) float array
+        Of the equations, which are linear in the moments, by each of n moments.
+    cross : (5, n, 5) float array
+        Of these by the unknowns.
+
+    Returns
+    -------
+    derivatives : Derivatives
+        Of Q by the moments.
+    """
+    inverse = np.linalg.inv(gradient)
+    first = -inverse @ by_moment
+    mixed = np.einsum("kni,im->kmn", cross, first)
     curved = np.einsum("kij,im,jn->kmn", hessian, first, first, optimize=True)
-    second = -np.einsum("lk,kmn->lmn", inverse, curved + cross + cross.transpose(0, 2, 1))
+    second = -np.einsum("lk,kmn->lmn", inverse, curved + mixed + mixed.transpose(0, 2, 1))
     return Derivatives(first=first[2:], second=second[2:])
 
 

@@ -33,11 +33,16 @@ def record(request):
     return keep
 
 
+def _number(section):
+    """Headings begin with their place on the page."""
+    return int(section[0].split(" ", 1)[0])
+
+
 def pytest_sessionfinish(session, exitstatus):
     if not session.config.getoption("--write-validation") or exitstatus:
         return
     text = HEAD
-    for heading, (columns, lines) in sorted(session.config.stash[SECTIONS].items()):
+    for heading, (columns, lines) in sorted(session.config.stash[SECTIONS].items(), key=_number):
         title, _, words = heading.partition(": ")
         text += f"\n## {title.split(' ', 1)[1]}\n\n{words}\n\n| " + " | ".join(columns) + " |\n"
         text += "|" + " --- |" * len(columns) + "\n"
