@@ -9,7 +9,7 @@ from scipy.special import beta, betainc
 from porrima import prediction
 from porrima.moments import INDICES
 from porrima.multiplicity import DucheneKraus2013
-from porrima.photometry import PHOTOMETRY, HabetsHeintze1981
+from porrima.photometry import PHOTOMETRY, HabetsHeintze1981, flux_ratio
 from porrima.prediction import integrate, population_moments, predict
 from porrima.psf import psf_from_name
 from porrima.response import response
@@ -206,6 +206,34 @@ def test_stacks_weighted_by_flux_against_simulated_ones(stars, fraction):
         2 * change.std()
     )
     assert_within_sigma(change.std(), found.sd[2, 0] * found.r2_0, error)
+
+
+def test_pairs_that_a_catalogue_has_made_keep_their_mass_ratio(stars):
+    """Given mass ratios through engine and closed form; half of the stars single, a few left to the model."""
+    rng = np.random.Generator(np.random.Philox(21))
+    given = np.where(rng.random(len(stars)) < 0.5, 0.0, rng.uniform(0.7, 1.0, len(stars)))
+    given[:30] = np.nan
+    models = {"multiplicity": DucheneKraus2013(), "photometry": PHOTOMETRY["main-sequence"]}
+    population = Population.of(dataclasses.replace(stars, mass_ratio=given), **models)
+    own = population.law.multiplicity_fraction
+    assert set(own[30:]) == {0.0, 1.0}
+    np.testing.assert_array_equal(
+        own[:30], DucheneKraus2013().companions(stars.mass[:30]).multiplicity_fraction
+    )
+    moments = population_moments(population, integrate(population))
+    drawn = draw_stacks(
+        population, n_stars=400, binary_fraction="model", seed=11, first=0, last=5000
+    ).moments.values
+    assert_within_sigma(drawn.mean(axis=0), moments.mean[0], drawn.std(axis=0) / np.sqrt(5000))
+    one = Population.of(
+        dataclasses.replace(stars, mass_ratio=np.full(len(stars), 0.9)).take(np.array([50])), **models
+    )
+    f = flux_ratio(one.tracks, one.stars.mass, np.array([[0.9]]))[0, 0]
+    unresolved = integrate(one)
+    second = unresolved.mean[0, 0] / (f / (1 + f) ** 2)  # E[r²; r < cut], the same for any mass ratio
+    free = integrate(Population.of(stars.take(np.array([50])), **models))
+    assert unresolved.unresolved[0] == pytest.approx(free.unresolved[0])
+    assert 0 < second < 0.05**2
 
 
 def test_equal_magnitudes_make_the_weights_equal():

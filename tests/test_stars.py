@@ -36,6 +36,7 @@ def test_selection_by_component():
         ({"mass": [0.3, -0.8, 1.5]}, "mass must be positive, got -0.8"),
         ({"distance": [100.0, 0.0, 1.0]}, "distance must be positive, got 0.0"),
         ({"magnitude": [18.0, np.nan, 18.0]}, "magnitude must be finite, got nan"),
+        ({"mass_ratio": [0.5, 1.2, 0.0]}, "mass_ratio must be .* in .* or NaN"),
         ({"distance": [100.0, 900.0]}, r"distance must be an array of shape \(3,\), got \(2,\)"),
     ],
 )
@@ -65,3 +66,9 @@ def test_no_bin_is_empty_of_width(low):
     edges = [(c["mag_lo"], c["mag_hi"]) for c in three().counts((low, low + 2.0), np.zeros(3))]
     assert len(edges) == 2
     assert all(hi - lo > 0.5 for lo, hi in edges)
+
+
+def test_mass_ratios_follow_their_stars():
+    stars = three(mass_ratio=[0.5, 0.0, np.nan])
+    assert stars.select(mass_max=1.0).mass_ratio.tolist() == [0.5, 0.0]
+    assert three().select(mass_max=1.0).mass_ratio is None

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from data_files import data_file
-from porrima.catalogs import read_catalog
+from porrima.catalogs import read_catalog, write_stars
 from porrima.errors import InputError
+from porrima.multiplicity import MULTIPLICITY
+from porrima.photometry import PHOTOMETRY
+from porrima.prediction import integrate, population_moments
+from porrima.systems import Population
 
 REAL = "catalogues/trilegal_with_binaries.table"
 
@@ -123,8 +127,8 @@ def test_companions_cannot_be_dropped_where_the_file_does_not_name_them(tmp_path
 
 def test_wrong_options_are_refused_by_name(tmp_path):
     path = saved(tmp_path, TRILEGAL)
-    with pytest.raises(InputError, match=r"^options, binaries: must be replace or drop, got keep$"):
-        read_catalog(path, options={"binaries": "keep"})
+    with pytest.raises(InputError, match=r"^options, binaries: must be replace, keep or drop, got hide$"):
+        read_catalog(path, options={"binaries": "hide"})
     with pytest.raises(InputError, match=r"^options: must be one of binaries, got binary$"):
         read_catalog(path, options={"binary": "drop"})
     with pytest.raises(InputError, match=r"^columns: must not be given for a TRILEGAL file"):
@@ -151,3 +155,21 @@ def test_broken_file_is_refused_in_one_clear_line(tmp_path, name):
     with pytest.raises(InputError) as caught:
         read_catalog(saved(tmp_path, TRILEGAL.replace(old, new)), format="trilegal")
     assert message in str(caught.value)
+
+
+def test_the_model_s_own_binaries_can_be_used_as_they_are(tmp_path):
+    own, replaced = (
+        read_catalog(data_file(REAL), options={"binaries": choice}).stars for choice in ("keep", "replace")
+    )
+    np.testing.assert_array_equal(own.magnitude, replaced.magnitude)
+    assert replaced.mass_ratio is None
+    paired = own.mass_ratio > 0
+    assert 0.25 < paired.mean() < 0.40  # the model's binary fraction is 0.3, of all its rows
+    assert own.mass_ratio[paired].min() >= 0.69  # and it draws ratios from 0.7 to 1
+    write_stars(own, tmp_path / "own.ecsv")
+    back = read_catalog(tmp_path / "own.ecsv").stars
+    np.testing.assert_array_equal(back.mass_ratio, own.mass_ratio)
+    models = {"multiplicity": MULTIPLICITY["dk13"], "photometry": PHOTOMETRY["main-sequence"]}
+    some = own.select(magnitude=(18, 20), mass_max=1.5)
+    moments = population_moments(p := Population.of(some, **models), integrate(p))
+    assert moments.binary_fraction[0] == np.mean(some.mass_ratio > 0)

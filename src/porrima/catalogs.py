@@ -34,7 +34,9 @@ __all__ = ["READERS", "Catalog", "read_catalog", "write_stars"]
 REQUIRED = {"mass": "solMass", "distance": "pc", "magnitude": "mag"}
 """Columns that a table must have, with the unit of a bare number."""
 
-OPTIONAL = {"metallicity": "dex", "log_age": "dex(yr)", "component": "", "luminosity_class": ""}
+OPTIONAL = {
+    "metallicity": "dex", "log_age": "dex(yr)", "component": "", "luminosity_class": "", "mass_ratio": "",
+}  # fmt: skip
 """Columns that it may have."""
 
 _ASSUMED = {"metallicity": 0.0, "log_age": 9.7}  # the Sun's, as `Stars.from_columns` takes them
@@ -151,6 +153,8 @@ def write_stars(stars: Stars, path: str | os.PathLike[str]) -> None:
     area = None if stars.area is None else float(stars.area)
     table = Table(meta={"band": stars.band, "area_deg2": area, "source": stars.source})
     for name, unit in (REQUIRED | OPTIONAL).items():
+        if name == "mass_ratio" and stars.mass_ratio is None:
+            continue
         if name != "luminosity_class":  # all are on the main sequence
             table[name] = getattr(stars, name)
             table[name].unit = unit or None
@@ -174,6 +178,8 @@ def _check(path: Path, rows: CatalogRows) -> None:
         ),
         *((quantity, np.isinf(rows.values[quantity]), "must be finite") for quantity in _ASSUMED),
     ]
+    if (ratio := rows.values.get("mass_ratio")) is not None:
+        bad.append(("mass_ratio", (ratio < 0) | (ratio > 1), "must be in [0, 1]"))
     for quantity, mask, rule in bad:
         refuse(path, rows.row, rows.names[quantity], rows.values[quantity], mask & looked_at, rule)
 
@@ -220,6 +226,7 @@ def _stars(rows: CatalogRows, keep: BoolArray, name: str) -> Stars:
         band=rows.band,
         area=rows.area,
         source=rows.source or name,
+        mass_ratio=rows.values["mass_ratio"][keep] if "mass_ratio" in rows.values else None,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -38,6 +38,8 @@ class CompanionLaw:
         Its standard deviation, in dex.
     log_a_max : (n,) float array
         log10 of the largest semi-major axis in au; infinite where there is none.
+    mass_ratio : (n,) float array
+        The mass ratio itself where a catalogue gives it, in (0, 1]; NaN where it is drawn.
     """
 
     multiplicity_fraction: FloatArray
@@ -46,6 +48,28 @@ class CompanionLaw:
     log_a: FloatArray
     log_a_sigma: FloatArray
     log_a_max: FloatArray
+    mass_ratio: FloatArray
+
+    def with_given(self, mass_ratio: FloatArray) -> CompanionLaw:
+        """The law with the pairs that a catalogue has made: their mass ratios fixed, its single stars single.
+
+        Parameters
+        ----------
+        mass_ratio : (n,) float array
+            In [0, 1], 0 for a single star, NaN where the law decides.
+
+        Returns
+        -------
+        law : CompanionLaw
+            Orbits as before, in log10 au.
+        """
+        return replace(
+            self,
+            multiplicity_fraction=np.where(
+                np.isnan(mass_ratio), self.multiplicity_fraction, (mass_ratio > 0).astype(float)
+            ),
+            mass_ratio=np.where(mass_ratio > 0, mass_ratio, np.nan),
+        )
 
 
 class MultiplicityModel(Protocol):
@@ -171,6 +195,7 @@ class DucheneKraus2013:
             log_a=log_a,
             log_a_sigma=2.0 / 3.0 * self.scatter_scale * table[:, 5],
             log_a_max=log_a + beyond,
+            mass_ratio=np.full(mass.shape, np.nan),
         )
 
 

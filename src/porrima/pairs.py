@@ -62,7 +62,8 @@ class Tables(NamedTuple):
     """A population as the compiled loops read it.
 
     The columns of `star`: mean and scatter of log2(a/d over the cut), cumulative probability of the longest
-    axis, the three numbers of the mass ratio (see `_companion_masses`), log2 of mass and flux of the primary,
+    axis, the three numbers of the mass ratio (see `_companion_masses`), log2 of the mass that it multiplies (the
+    primary's, or the companion's where it is given) and of the flux of the primary,
     four weights of its tracks, the first of these, its weight in the stack, its multiplicity fraction.
     """
 

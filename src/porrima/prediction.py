@@ -232,8 +232,11 @@ def _flux_ratio_nodes(population: Population, some: slice) -> tuple[FloatArray, 
     norm = np.where(np.abs(g) > 1e-9, (1 - q_min**power) / power, -np.log(q_min))
     tracks = population.tracks
     some_tracks = replace(tracks, index=tracks.index[some], weight=tracks.weight[some])
-    f = np.where(span > 0, flux_ratio(some_tracks, mass, q), 0.0)
-    return f, panel_weight * span * q**g / norm
+    weight = panel_weight * span * q**g / norm
+    given = ~np.isnan(law.mass_ratio[some])
+    q[given], weight[given] = law.mass_ratio[some][given, None], 1.0 / q.shape[1]
+    f = flux_ratio(some_tracks, mass, q)
+    return np.where((span > 0) | given[:, None], f, 0.0), weight
 
 
 def population_moments(

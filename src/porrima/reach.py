@@ -25,7 +25,7 @@ DIVERGES = 1e-3
 """Share of R² in the outer fifth of the stamp above which plain moments have not converged (dimensionless)."""
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=16)
 def settled(estimator: Estimator, psf: PSF) -> Estimator:
     """Estimator that measures stars behind a PSF: plain moments that diverge get an aperture.
 
@@ -52,7 +52,7 @@ def settled(estimator: Estimator, psf: PSF) -> Estimator:
     return estimator if abs(second.sum() - inner) <= DIVERGES * abs(inner) else Plain(APERTURE)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=16)
 def stamp_reach(estimator: Estimator, psf: PSF) -> float:
     """Least half width of a stamp of a PSF that holds all that an estimator weighs.
 

@@ -38,7 +38,8 @@ class CatalogRows:
         The file's own column name of each quantity in `values`.
     values : mapping of str to (n,) float array
         ``mass`` [M_sun], ``distance`` [pc], ``magnitude`` [mag], ``metallicity`` [dex], ``log_age``
-        [log10 yr] and, where there is one, ``luminosity_class``; NaN where the file gives nothing.
+        [log10 yr] and, where there are such, ``luminosity_class`` and ``mass_ratio`` [in [0, 1]]; NaN where the
+        file gives nothing.
     component : (n,) str array
         One of `porrima.stars.COMPONENTS`.
     band : str

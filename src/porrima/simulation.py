@@ -47,7 +47,7 @@ Method = Literal["moments", "images"]
 CHUNK = 10_000
 """Stacks in a chunk: what an interruption can lose."""
 
-_STAR_COLUMNS = ("mass", "distance", "magnitude", "metallicity", "log_age")
+_STAR_COLUMNS = ("mass", "distance", "magnitude", "metallicity", "log_age", "mass_ratio")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,6 +139,8 @@ def open_run(path: Path) -> tuple[xr.Dataset, RunConfig, Population]:
         dataset = xr.open_zarr(path, chunks=None)
         config = parse(RunConfig, json.loads(dataset.attrs["config"]), source=path)
         columns = {name: dataset[f"star_{name}"].to_numpy() for name in _STAR_COLUMNS}
+        if np.all(np.isnan(columns["mass_ratio"])):
+            columns["mass_ratio"] = None
         stars = Stars.from_columns(**columns, band=dataset.attrs["band"], source=dataset.attrs["stars"])
     except (OSError, KeyError, ValueError):
         raise InputError("is not a run of porrima simulate", source=path) from None
@@ -234,7 +236,7 @@ class _Run:
         digest = hashlib.sha256(f"{canonical(rest)} {self.method} {__version__}".encode())
         digest.update(self.population.stars.band.encode())
         for name in _STAR_COLUMNS:
-            digest.update(np.ascontiguousarray(getattr(self.population.stars, name)).tobytes())
+            digest.update(_star_column(self.population.stars, name).tobytes())
         return digest.hexdigest()
 
 
@@ -340,9 +342,7 @@ def _create(run: _Run, path: Path, chunk: int) -> None:
         f"{name}_0": (("psf",), np.array([float(np.squeeze(getattr(shape, name))) for shape in alone]), attrs)
         for name, attrs in (("e1", {}), ("e2", {}), ("r2", {"units": "arcsec2"}))
     }
-    stars = {
-        f"star_{name}": (("star",), np.asarray(getattr(run.population.stars, name))) for name in _STAR_COLUMNS
-    }
+    stars = {f"star_{name}": (("star",), _star_column(run.population.stars, name)) for name in _STAR_COLUMNS}
     known = xr.Dataset(
         {**scalars, **stars},
         coords={"psf": list(config.psf), "moment": [f"m{a}{b}" for a, b in INDICES]},
@@ -376,6 +376,12 @@ def _create(run: _Run, path: Path, chunk: int) -> None:
             attributes={"_ARRAY_DIMENSIONS": list(dimensions)},
         )
     zarr.consolidate_metadata(path)
+
+
+def _star_column(stars: Stars, name: str) -> FloatArray:
+    """Column of the stars as the store keeps it: mass ratios are NaN where none is given."""
+    values = getattr(stars, name)
+    return np.full(len(stars), np.nan) if values is None else np.ascontiguousarray(values)
 
 
 def _references(config: RunConfig) -> list[str]:

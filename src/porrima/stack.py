@@ -181,8 +181,9 @@ def _tables(population: Population) -> Tables:
     offset = tracks.index[0] - tracks.index[0, 0]
     if np.any(tracks.index - tracks.index[:, :1] != offset):
         raise ValueError(f"tracks must lie alike for all stars, got {tracks.index}")
+    given = ~np.isnan(law.mass_ratio)
     g = law.mass_ratio_exponent + 1
-    power_law = np.abs(g) > 1e-9
+    power_law = (np.abs(g) > 1e-9) & ~given
     log2_10, magnitude_to_log2 = math.log2(10.0), -0.4 * math.log2(10.0)
     columns = [
         (law.log_a - np.log10(stars.distance)) * log2_10 - math.log2(population.cut),  # au / pc = arcsec
@@ -190,8 +191,8 @@ def _tables(population: Population) -> Tables:
         ndtr((law.log_a_max - law.log_a) / law.log_a_sigma),
         np.divide(1.0, g, out=np.zeros_like(g), where=power_law),
         np.where(power_law, law.mass_ratio_min ** np.where(power_law, g, 1.0), 1.0),
-        np.where(power_law, 0.0, np.log2(law.mass_ratio_min)),
-        np.log2(stars.mass),
+        np.where(power_law | given, 0.0, np.log2(law.mass_ratio_min)),
+        np.log2(stars.mass * np.where(given, law.mass_ratio, 1.0)),
         magnitudes(tracks, stars.mass[:, None])[:, 0] * magnitude_to_log2,
         *tracks.weight.T,
         tracks.index[:, 0],

@@ -56,6 +56,9 @@ class Stars:
         Solid angle that the stars fill, in deg²; None where unknown.
     source : str
         Where the stars come from.
+    mass_ratio : (n,) float array, optional
+        Companion mass over primary mass where the catalogue itself has made the pair, in [0, 1]: 0 for a star
+        that it says is single, NaN where it says nothing and the multiplicity model is to decide.
 
     Raises
     ------
@@ -72,9 +75,14 @@ class Stars:
     band: str
     area: float | None = None
     source: str = ""
+    mass_ratio: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = np.shape(self.mass)
+        if self.mass_ratio is not None:
+            wrong = (self.mass_ratio < 0) | (self.mass_ratio > 1)
+            if self.mass_ratio.shape != n or np.any(wrong):
+                raise ValueError(f"mass_ratio must be {n} numbers in [0, 1] or NaN, got {self.mass_ratio}")
         for name in ("mass", "distance", "magnitude", "metallicity", "log_age", "component"):
             values = np.asarray(getattr(self, name))
             if values.ndim != 1 or values.shape != n:
@@ -97,6 +105,7 @@ class Stars:
         band: str = "i",
         area: float | None = None,
         source: str = "",
+        mass_ratio: Any = None,
     ) -> Stars:
         """Stars from columns that may be incomplete.
 
@@ -114,6 +123,8 @@ class Stars:
             Solid angle, in deg².
         source : str
             Where the stars come from.
+        mass_ratio : (n,) array-like, optional
+            In [0, 1]; NaN, or not given at all, where the multiplicity model decides.
 
         Returns
         -------
@@ -137,6 +148,7 @@ class Stars:
             band=band,
             area=area,
             source=source,
+            mass_ratio=None if mass_ratio is None else full("mass_ratio", mass_ratio),
         )
 
     def __len__(self) -> int:
@@ -163,6 +175,7 @@ class Stars:
             metallicity=self.metallicity[index],
             log_age=self.log_age[index],
             component=self.component[index],
+            mass_ratio=None if self.mass_ratio is None else self.mass_ratio[index],
         )
 
     def select(

@@ -100,6 +100,8 @@ class Population:
             raise InputError("must be positive and finite [arcsec]", key="cut", value=cut)
         try:
             law = multiplicity.companions(stars.mass)
+            if stars.mass_ratio is not None:
+                law = law.with_given(stars.mass_ratio)
             tracks = photometry.tracks(stars.mass, stars.metallicity, stars.log_age, stars.band)
         except ValueError as error:
             raise InputError(str(error), source=stars.source or None) from None

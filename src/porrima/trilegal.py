@@ -48,15 +48,17 @@ class TrilegalOptions:
 
     Parameters
     ----------
-    binaries : {"replace", "drop"}
+    binaries : {"replace", "keep", "drop"}
         For ``replace``, a row with a companion is one catalogued star like any other: it has the mass of the
         star that the row is about and the magnitude of the pair, and Porrima's own statistics decide about
-        its companion.  For ``drop`` such a row is left out and counted.
+        its companion.  For ``keep`` the model's own pairs are used as they are: their mass ratios, and its
+        single stars single; only the orbits, which it does not give, are Porrima's.  For ``drop`` a row with a
+        companion is left out and counted.
 
     Raises
     ------
     InputError
-        If it is neither.
+        If it is none of these.
 
     Notes
     -----
@@ -70,8 +72,11 @@ class TrilegalOptions:
     binaries: str = "replace"
 
     def __post_init__(self) -> None:
-        if self.binaries not in ("replace", "drop"):
-            raise InputError("must be replace or drop", key="options, binaries", value=self.binaries)
+        if self.binaries not in ("replace", "keep", "drop"):
+            raise InputError("must be replace, keep or drop", key="options, binaries", value=self.binaries)
+
+
+_NAMES = {"distance": "m-M0", "metallicity": "[M/H]", "log_age": "logAge", "mass_ratio": "m2/m1"}
 
 
 def read_trilegal(file: CatalogFile) -> CatalogRows:
@@ -134,13 +139,18 @@ def read_trilegal(file: CatalogFile) -> CatalogRows:
         "luminosity_class": np.where((columns["logg"] >= low) & (columns["logg"] < high), 5.0, 0.0),
     }
     rejected = {}
-    if options.binaries == "drop":
+    if options.binaries != "replace":
         if "m2/m1" not in loaded.names:
-            raise InputError("must be there, for binaries = drop", source=file.path, column="m2/m1")
-        rejected["with a companion of its own"] = _column(file, loaded, "m2/m1") > 0
+            rule = f"must be there, for binaries = {options.binaries}"
+            raise InputError(rule, source=file.path, column="m2/m1")
+        ratio = _column(file, loaded, "m2/m1")
+        if options.binaries == "drop":
+            rejected["with a companion of its own"] = ratio > 0
+        else:
+            values["mass_ratio"] = ratio
     return CatalogRows(
         row=loaded.row,
-        names={"mass": mass_name, "distance": "m-M0", "metallicity": "[M/H]", "log_age": "logAge"},
+        names=_NAMES | {"mass": mass_name},
         values=values,
         component=_components(file, columns["Gc"], columns["logAge"], loaded.row),
         band=band,
