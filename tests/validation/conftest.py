@@ -1,5 +1,6 @@
 """Validation tests can write what they measured: ``pytest tests/validation --write-validation``."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,8 @@ def record(request):
 
 def _number(section):
     """Headings begin with their place on the page."""
-    return int(section[0].split(" ", 1)[0])
+    number, letter = re.match(r"(\d+)(\w*)", section[0]).groups()
+    return int(number), letter
 
 
 def pytest_sessionfinish(session, exitstatus):

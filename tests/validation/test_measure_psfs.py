@@ -16,19 +16,19 @@ from porrima.shapes import Adaptive
 from porrima.systems import Systems
 
 MEASURE = (
-    "8 Shapes from moments behind any PSF: stacks drawn with GalSim (0.1/12 arcsec per pixel or finer) and measured "
+    "10 Shapes from moments behind any PSF: stacks drawn with GalSim (0.1/12 arcsec per pixel or finer) and measured "
     "with its HSM (precision 1e-10, ended in float64), against shapes from kernel moments.  Random tables of stars, "
     "35 % of them and all of them pairs with r < 0.05 arcsec.  Largest difference of the changes of e1, e2 and "
     "R²/R0², over the size change that the images give."
 )
 DRAWING = (
-    "8b How finely GalSim's own profiles must be drawn: GalSim's object itself, a quintic through its samples, drawn "
+    "10b How finely GalSim's own profiles must be drawn: GalSim's object itself, a quintic through its samples, drawn "
     "coarsely and finely and measured with HSM, against Porrima's shapes from moments; largest difference over the "
     "size change, five tables of five stars with one or two pairs.  Porrima does not move: the kinks of the quintic "
     "spoil sums over coarse pixels, differently for each place of a star in its pixel."
 )
 PATTERN = (
-    "8c What GalSim's quintic does to Roman's PSFs: `galsim.roman` samples its diffraction pattern at half of "
+    "10c What GalSim's quintic does to Roman's PSFs: `galsim.roman` samples its diffraction pattern at half of "
     "lambda/D; `roman` is the quintic through these samples, as GalSim draws it, `roman-exact` the pattern itself.  "
     "Adaptive R² without companions and kappa, bare and behind a pixel of 0.11 arcsec."
 )

@@ -20,28 +20,28 @@ from porrima.systems import Systems
 from porrima.toy import headline, toy_maps
 
 KAPPA = (
-    "9 Response to an isotropic population across PSFs: Kappa is δR² / (R0² η) for r → 0; `drawn` is a ring of equal "
+    "11 Response to an isotropic population across PSFs: Kappa is δR² / (R0² η) for r → 0; `drawn` is a ring of equal "
     "companions at r = 0.002 arcsec, drawn with GalSim and measured on its pixels.  The formulae of the paper have 1, "
     "and −e0 for the ellipticity.  Plain moments of PSFs with wings are taken within 0.75 arcsec."
 )
 HSM = (
-    "10 Batched adaptive moments against HSM: The same images in GalSim's HSM (precision 1e-10, results in float32), "
+    "12 Batched adaptive moments against HSM: The same images in GalSim's HSM (precision 1e-10, results in float32), "
     "largest differences where it converges.  Speed is HSM's time per image, on one thread, over that of the batch, on "
     "all threads, in this run: best of three."
 )
 STATEMENT_12 = (
-    "11 The PSF's shape and the Gaussian formulae: The paper finds no significant departure for optical PSFs, and none "
+    "13 The PSF's shape and the Gaussian formulae: The paper finds no significant departure for optical PSFs, and none "
     "from turning the struts.  Size: κ, and κ over that of a Gaussian of the same R² under the same weight.  "
     "Ellipticity: −δe·e0/(e0² η).  With the wide weight the formulae hold to some per cent for every PSF; with "
     "adaptive moments they do not."
 )
 PIXELS = (
-    "12 Survey pixels, pixel phase and centring: One stack of 40 stars, 35 % pairs, relative size change.  `fine`: on "
+    "14 Survey pixels, pixel phase and centring: One stack of 40 stars, 35 % pairs, relative size change.  `fine`: on "
     "a fine grid; `survey pixels`: mean and standard deviation over 16 places in the pixel, each against the PSF at "
     "that place, where both can be measured; `measured centres`: each star centred on its measured centroid."
 )
 TOY = (
-    "13 The toy map in numbers: Gaussian PSF, FWHM 0.137 arcsec, e0 = 0.05, adaptive moments, the worst direction.  "
+    "15 The toy map in numbers: Gaussian PSF, FWHM 0.137 arcsec, e0 = 0.05, adaptive moments, the worst direction.  "
     "`from PSF to PSF`: largest difference between the maps of a PSF along e1 and one along e2, over the largest value."
 )
 NOTHING = Systems.from_pairs(*np.zeros((3, 1)))
