@@ -4,7 +4,8 @@ from astropy import units as u
 from astropy.table import Table
 
 from porrima.errors import InputError
-from porrima.io import make_folder, read_systems, write_rows, write_whole
+from porrima.files import make_folder, write_whole
+from porrima.io import read_systems, write_rows
 
 
 def table(tmp_path, text):

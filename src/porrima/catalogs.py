@@ -11,11 +11,12 @@ import numpy as np
 from porrima.besancon import SIGNATURE as BESANCON
 from porrima.besancon import read_besancon
 from porrima.errors import InputError
+from porrima.files import write_table
 from porrima.gaia import SIGNATURE as GAIA
 from porrima.gaia import read_gaia
 from porrima.rows import CatalogRows, NoOptions, parsed_options, refuse, table_area
 from porrima.stars import COMPONENTS, Stars
-from porrima.tables import CatalogFile, column_values, load_columns, open_catalog, write_table
+from porrima.tables import CatalogFile, column_values, load_columns, open_catalog
 from porrima.trilegal import SIGNATURE as TRILEGAL
 from porrima.trilegal import read_trilegal
 

@@ -279,7 +279,7 @@ def paper(
     """The paper's figure of errors and biases against binary fraction, with its numbers."""
     from porrima.answers import NUMBER_COLUMNS, number_lines
     from porrima.experiments import errors_and_biases, paper_config
-    from porrima.io import make_folder
+    from porrima.files import make_folder
     from porrima.report import write_report
     from porrima.summary import rows
 

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from porrima.errors import InputError
+from porrima.files import write_table
 from porrima.photometry import MainSequence, magnitudes
 from porrima.rows import CatalogRows, parsed_options, refuse, table_area
-from porrima.tables import column_values, load_columns, write_table
+from porrima.tables import column_values, load_columns
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,23 +1,23 @@
-"""Tables of pairs in, tables of numbers out; a file is written whole or not at all."""
+"""Tables of pairs in, tables of numbers and figures out."""
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from porrima.errors import InputError
+from porrima.files import write_table, write_whole
 from porrima.systems import Systems
 from porrima.tables import column_values, load_table, open_catalog
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from matplotlib.figure import Figure
 
-__all__ = ["make_folder", "read_systems", "write_figure", "write_rows", "write_whole"]
+__all__ = ["read_systems", "write_figure", "write_rows"]
 
 _PAIR_COLUMNS = {"flux_ratio": "", "dx": "arcsec", "dy": "arcsec"}
 _WIDEST = 10.0  # arcsec; what is wider is no unresolved pair for any survey
@@ -70,62 +70,6 @@ def read_systems(path: Path) -> Systems:
     return Systems.from_pairs(f, values["dx"], values["dy"], w)
 
 
-def make_folder(path: Path) -> None:
-    """A folder that can be written, made where it is not there.
-
-    Parameters
-    ----------
-    path : Path
-        The folder.
-
-    Returns
-    -------
-    None
-        The result is the folder.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made or written.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot be made ({error.strerror})", key="output", value=path) from None
-    if not os.access(path, os.W_OK):
-        raise InputError("must be a folder that can be written", key="output", value=path)
-
-
-def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """A file written under a temporary name beside its place, then renamed.
-
-    Parameters
-    ----------
-    path : Path
-        The file, replaced if it exists.
-    write : callable
-        Writes to the path that it is given; its suffix is that of `path`.
-
-    Returns
-    -------
-    None
-        The result is the file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    unfinished = path.with_name(f".{os.getpid()}-{path.name}")
-    try:
-        write(unfinished)
-        unfinished.replace(path)
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", key="output", value=path) from None
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
 def write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Rows of equal keys as a table (ECSV).
 
@@ -144,7 +88,7 @@ def write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:
     from astropy.table import Table  # noqa: PLC0415  (slow to import)
 
     table = Table(rows=list(rows))
-    write_whole(path, lambda unfinished: table.write(unfinished, format="ascii.ecsv"))
+    write_table(table, path)
 
 
 _NO_DATE: dict[str, dict[str, Any]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}

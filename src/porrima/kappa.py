@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from porrima import figures
 from porrima.errors import InputError
-from porrima.io import make_folder, write_rows, write_whole
+from porrima.files import make_folder, write_whole
+from porrima.io import write_rows
 from porrima.moments import INDICES
 from porrima.psf import psf_from_name
 from porrima.response import response

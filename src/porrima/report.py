@@ -10,8 +10,9 @@ import numpy as np
 
 from porrima import __version__
 from porrima.figures import errors_and_biases
+from porrima.files import write_whole
 from porrima.instruments import KCM16
-from porrima.io import write_figure, write_rows, write_whole
+from porrima.io import write_figure, write_rows
 from porrima.summary import rows
 
 if TYPE_CHECKING:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import gzip
 import io
-import os
 import re
 import warnings
 import zlib
@@ -35,7 +34,6 @@ __all__ = [
     "load_columns",
     "load_table",
     "open_catalog",
-    "write_table",
 ]
 
 
@@ -312,40 +310,6 @@ def _load_parquet(path: Path, wanted: Collection[str] | None) -> LoadedTable:
     if not chosen:
         return _loaded(Table(), names)
     return _loaded(Table.read(path, format="parquet", include_names=chosen), names)
-
-
-def write_table(table: Any, path: Path) -> None:
-    """ECSV file of a table that appears whole or not at all.
-
-    Parameters
-    ----------
-    table : astropy.table.Table
-        The table.
-    path : Path
-        The file, replaced if it exists.
-
-    Returns
-    -------
-    None
-        The result is the file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    try:
-        partial_path = path.with_name(f".{path.name}.{os.getpid()}.partial")
-        try:
-            with partial_path.open("x", encoding="utf-8") as stream:
-                table.write(stream, format="ascii.ecsv")
-            os.replace(partial_path, path)
-        finally:
-            partial_path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError("must be writable", source=path, value=error.strerror) from None
-    except ValueError:  # no name at all, or a NUL in it
-        raise InputError("must be the name of a file", source=repr(str(path))) from None
 
 
 def _load_text(path: Path, lines: list[str]) -> tuple[Any, IntArray]:

@@ -10,8 +10,8 @@ import xarray as xr
 
 from porrima import figures
 from porrima.errors import InputError
+from porrima.files import make_folder, write_whole
 from porrima.images import measure_stack
-from porrima.io import make_folder, write_whole
 from porrima.moments import KernelMoments, moments_of_points
 from porrima.psf import sheared_gaussian
 from porrima.response import response
