@@ -117,6 +117,17 @@ def test_another_configuration_does_not_mix(finished):
     assert contents(finished) == before
 
 
+def test_a_psf_whose_file_has_changed_does_not_mix(tmp_path):
+    psf = tmp_path / "psf.yaml"
+    config = small(psf=str(psf), n_stacks=10)
+    psf.write_text("psf: {type: Gaussian, fwhm: 0.14}\n")
+    simulate(config, tmp_path / "run.zarr")
+    assert simulate(config, tmp_path / "run.zarr", resume=True) == 0
+    psf.write_text("psf: {type: Gaussian, fwhm: 0.15}\n")
+    with pytest.raises(InputError, match="holds a run of another configuration"):
+        simulate(config, tmp_path / "run.zarr", resume=True)
+
+
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(InputError, match=r"output: must lie in a folder that can be written, got .*nowhere"):
         simulate(small(), tmp_path / "nowhere" / "run.zarr")

@@ -235,6 +235,10 @@ class _Run:
         rest = self.config.model_copy(update={"stars": None})  # wherever the stars came from, here they are
         digest = hashlib.sha256(f"{canonical(rest)} {self.method} {__version__}".encode())
         digest.update(self.population.stars.band.encode())
+        for psf in self.config.psf:  # a file of that name may have changed
+            shape = self.shape_without_companions(psf)
+            numbers = [float(np.squeeze(value)) for value in (shape.e1, shape.e2, shape.r2)]
+            digest.update(" ".join(f"{number:.9f}" for number in numbers).encode())
         for name in _STAR_COLUMNS:
             digest.update(_star_column(self.population.stars, name).tobytes())
         return digest.hexdigest()
