@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from astropy import units as u
 
 from porrima.stars import Stars
 
@@ -72,3 +73,10 @@ def test_mass_ratios_follow_their_stars():
     stars = three(mass_ratio=[0.5, 0.0, np.nan])
     assert stars.select(mass_max=1.0).mass_ratio.tolist() == [0.5, 0.0]
     assert three().select(mass_max=1.0).mass_ratio is None
+
+
+def test_quantities_are_taken_in_any_unit():
+    stars = three(mass=np.array([0.3, 0.8, 1.5]) * u.solMass, distance=np.array([0.1, 0.9, 3.0]) * u.kpc)
+    np.testing.assert_allclose(stars.distance, three().distance)
+    with pytest.raises(ValueError, match="distance must be in a unit convertible to pc, got kg"):
+        three(distance=np.ones(3) * u.kg)

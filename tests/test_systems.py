@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from astropy import units as u
 
 from porrima.errors import InputError
 from porrima.moments import INDICES
@@ -55,3 +56,9 @@ def test_a_population_needs_stars_in_range_and_a_cut():
     light = Stars.from_columns(mass=[0.05], distance=[100.0], magnitude=[18.5])
     with pytest.raises(InputError, match=r"mass must be in \[0.08, 1.5\] M_sun for main-sequence, got 0.05"):
         Population.of(light, **models)
+
+
+def test_offsets_may_be_quantities():
+    bare = Systems.from_pairs([0.5], [0.03], [0.0])
+    milli = Systems.from_pairs([0.5], [30] * u.mas, [0] * u.mas)
+    np.testing.assert_allclose(bare.x, milli.x)

@@ -10,6 +10,7 @@ import galsim
 import numpy as np
 from scipy.special import j1
 
+from porrima.instruments import EUCLID_VIS
 from porrima.sampling import HALF_WIDTH
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class Pupil:
     strut_angle: float = 0.0
 
 
-EUCLID_LIKE = Pupil(diameter=1.2, obscuration=0.35, strut_pairs=3, strut_thickness=0.01)
+EUCLID_LIKE = Pupil(diameter=EUCLID_VIS.diameter, obscuration=0.35, strut_pairs=3, strut_thickness=0.01)
 """Six struts, as KCM16 has them.  The obscuration, 0.42 m, is that which leaves Euclid's collecting area of
 0.9926 m² of its 1.2 m (as in GalSim-Euclid-Like); the struts are 12 mm thick."""
 

@@ -10,6 +10,8 @@ import galsim
 import numpy as np
 from scipy import fft, signal
 
+from porrima.units import SIGMA_PER_FWHM
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -124,7 +126,7 @@ def fwhm_of(profile: Any) -> float:
     if hasattr(profile, "fwhm") or not profile.is_analytic_x:
         return float(profile.calculateFWHM())
     side = 4 * FWHM_PIXELS + 1
-    fwhm = 2 * math.sqrt(2 * math.log(2)) * math.sqrt(profile.flux / (2 * math.pi * profile.max_sb))
+    fwhm = math.sqrt(profile.flux / (2 * math.pi * profile.max_sb)) / SIGMA_PER_FWHM
     for _ in range(8):
         scale, before = fwhm / FWHM_PIXELS, fwhm
         drawn = profile.drawImage(nx=side, ny=side, scale=scale, method="no_pixel", dtype=float).array

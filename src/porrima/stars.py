@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from porrima.units import to_internal
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -112,7 +114,7 @@ class Stars:
         Parameters
         ----------
         mass, distance, magnitude : (n,) array-like
-            In M_sun, pc, mag.
+            Bare numbers in M_sun, pc, mag, or astropy Quantities.
         metallicity, log_age : (n,) array-like or float, optional
             In dex and log10 yr; where not given, the Sun's metallicity and 5 Gyr.
         component : (n,) array-like, optional
@@ -131,7 +133,7 @@ class Stars:
         stars : Stars
             The same stars, complete.
         """
-        mass = np.atleast_1d(np.asarray(mass, dtype=float))
+        mass = np.atleast_1d(np.asarray(to_internal(mass, "mass"), dtype=float))
 
         def full(name: str, values: Any) -> FloatArray:
             filled = _DEFAULTS[name] if values is None else values
@@ -140,8 +142,8 @@ class Stars:
         names = np.full(mass.shape, "unknown") if component is None else np.asarray(component, dtype=str)
         return cls(
             mass=mass,
-            distance=np.atleast_1d(np.asarray(distance, dtype=float)),
-            magnitude=np.atleast_1d(np.asarray(magnitude, dtype=float)),
+            distance=np.atleast_1d(np.asarray(to_internal(distance, "distance"), dtype=float)),
+            magnitude=np.atleast_1d(np.asarray(to_internal(magnitude, "magnitude"), dtype=float)),
             metallicity=full("metallicity", metallicity),
             log_age=full("log_age", log_age),
             component=names,

@@ -10,6 +10,7 @@ import numpy as np
 from porrima.errors import InputError
 from porrima.moments import KernelMoments, moments_of_points
 from porrima.multiplicity import multiplicity_scale
+from porrima.units import to_internal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -159,7 +160,7 @@ class Systems:
         flux_ratio : (n,) float array
             Companion flux over primary flux, in [0, 1]; 0 for a single star.
         dx, dy : (n,) float array
-            Companion offset from the primary along the detector axes, in arcsec.
+            Companion offset from the primary along the detector axes, in arcsec, or an astropy Quantity.
         weight : (n,) float array, optional
             Weight in the stack, dimensionless; 1 where not given.
 
@@ -174,6 +175,7 @@ class Systems:
             If a flux ratio lies outside [0, 1], an offset is not finite, or the weights do not sum to
             more than 0.
         """
+        dx, dy = to_internal(dx, "angle"), to_internal(dy, "angle")
         f, dx, dy = (np.atleast_1d(np.asarray(v, dtype=float)) for v in (flux_ratio, dx, dy))
         w = np.ones_like(f) if weight is None else np.atleast_1d(np.asarray(weight, dtype=float))
         for name, values, good, rule in (

@@ -12,6 +12,7 @@ from porrima import figures
 from porrima.errors import InputError
 from porrima.files import make_folder, write_whole
 from porrima.images import measure_stack
+from porrima.instruments import EUCLID_VIS
 from porrima.moments import KernelMoments, moments_of_points
 from porrima.psf import sheared_gaussian
 from porrima.response import response
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["headline", "toy_maps", "write_toy"]
 
-PIXEL = 0.1
+PIXEL = EUCLID_VIS.pixel
 """Side of the central pixel, that of Euclid's VIS, in arcsec."""
 
 NEAR = 0.01
