@@ -247,7 +247,15 @@ def number_lines(rows: list[dict[str, Any]]) -> list[list[Any]]:
         + [
             text
             for name in ("bias", "sigma", "sd")
-            for text in (f"{row[name]:.2e} ± {row[f'{name}_se']:.0e}", f"{row[f'prediction_{name}']:.2e}")
+            for text in (
+                f"{row[name]:.2e} ± {row[f'{name}_se']:.0e}",
+                _predicted_text(row[f"prediction_{name}"]),
+            )
         ]
         for row in rows
     ]
+
+
+def _predicted_text(value: float) -> str:
+    """A prediction with three figures; what symmetry makes 0 is not shown as its rounding error."""
+    return "0" if abs(value) < 1e-12 else f"{value:.2e}"

@@ -19,6 +19,7 @@ from porrima.shapes import estimator_from_name
 from porrima.stack import draw_stacks, draw_systems
 
 if TYPE_CHECKING:
+    from porrima.stack import Stacks
     from porrima.systems import Population
 
 __all__ = ["Speed", "measure_speed"]
@@ -76,11 +77,14 @@ def measure_speed(*, n_stars: int = 40, n_stacks: int = 100_000, seed: int = 1) 
         RunConfig, {"stars": {"l": 180, "b": 45, "mag": [18, 19]}, "binary_fraction": 0.35, "seed": seed}
     )
     population = population_of(config, draw_stars(config))
-    run = {"n_stars": n_stars, "binary_fraction": 0.35, "seed": seed}
+
+    def draw(last: int) -> Stacks:
+        return draw_stacks(population, n_stars=n_stars, binary_fraction=0.35, seed=seed, first=0, last=last)
+
     reply = response(psf_from_name("psf1"), estimator_from_name("adaptive"))
-    reply.shapes(draw_stacks(population, first=0, last=2, **run).moments)  # type: ignore[arg-type]  # compiled here
+    reply.shapes(draw(2).moments)  # compiled here
     start = time.perf_counter()
-    stacks = draw_stacks(population, first=0, last=n_stacks, **run)  # type: ignore[arg-type]
+    stacks = draw(n_stacks)
     drawn = time.perf_counter()
     reply.shapes(stacks.moments)
     measured = time.perf_counter()

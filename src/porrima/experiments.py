@@ -116,14 +116,15 @@ def errors_and_biases(
     """
     simulate(config, store, resume=store.exists(), progress=progress)
     run, config, population = open_run(store)
-    moments = population_moments(population, integrate(population), np.array([0.35]))
-    curves = predicted_curves(population, config, config.n_stars)
+    integrals = integrate(population)
+    moments = population_moments(population, integrals, np.array([0.35]))
+    curves = predicted_curves(population, config, config.n_stars, integrals=integrals)
     curves.attrs["n_stars"] = config.n_stars
     return ErrorsAndBiases(
         config=config,
-        summary=summarise(run, config, population),
+        summary=summarise(run, config, population, integrals=integrals),
         curves=curves,
-        limit=predicted_curves(population, config, None),
+        limit=predicted_curves(population, config, None, integrals=integrals),
         mean_x=float(moments.mean_x[0]),
         removed_fraction=float(moments.removed_fraction[0]),
     )

@@ -163,9 +163,15 @@ class _Run:
 
     def chunk(self, first: int, last: int) -> _Chunk:
         config = self.config
-        draw = {"n_stars": config.n_stars, "binary_fraction": config.binary_fraction, "seed": config.seed}
         try:
-            stacks = draw_stacks(self.population, first=first, last=last, **draw)  # type: ignore[arg-type]
+            stacks = draw_stacks(
+                self.population,
+                n_stars=config.n_stars,
+                binary_fraction=config.binary_fraction,
+                seed=config.seed,
+                first=first,
+                last=last,
+            )
         except ValueError as error:
             raise InputError(str(error)) from None
         shapes = np.empty((3, len(config.psf), last - first))

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from porrima.config import RunConfig
+    from porrima.prediction import PairIntegrals
     from porrima.systems import Population
 
     FloatArray = NDArray[np.float64]
@@ -73,7 +74,11 @@ def statistics(change: FloatArray) -> dict[str, float]:
 
 
 def predicted_curves(
-    population: Population, config: RunConfig, n_stars: int | None, fractions: FloatArray | None = None
+    population: Population,
+    config: RunConfig,
+    n_stars: int | None,
+    fractions: FloatArray | None = None,
+    integrals: PairIntegrals | None = None,
 ) -> xr.Dataset:
     """Predicted bias and scatter of a run against binary fraction.
 
@@ -87,6 +92,8 @@ def predicted_curves(
         Stars in a stack (count); None for infinitely many.
     fractions : (k,) float array, optional
         Binary fractions, in [0, 1]; a fine grid where not given.
+    integrals : PairIntegrals, optional
+        Of the population, where they are known already.
 
     Returns
     -------
@@ -94,7 +101,7 @@ def predicted_curves(
         ``bias``, ``sd``, ``sigma`` over (psf, quantity, binary_fraction), dimensionless.
     """
     grid = np.linspace(0.0, 1.0, _FRACTIONS) if fractions is None else fractions
-    moments = population_moments(population, integrate(population), grid)
+    moments = population_moments(population, integrals or integrate(population), grid)
     estimator = estimator_from_name(config.estimator)
     psfs = [psf_from_name(name, **config.psf_options) for name in config.psf]
     predictions = [predict(moments, response(psf, estimator), n_stars) for psf in psfs]
@@ -108,7 +115,13 @@ def predicted_curves(
     )
 
 
-def summarise(run: xr.Dataset, config: RunConfig, population: Population, bins: int = 20) -> xr.Dataset:
+def summarise(
+    run: xr.Dataset,
+    config: RunConfig,
+    population: Population,
+    bins: int = 20,
+    integrals: PairIntegrals | None = None,
+) -> xr.Dataset:
     """Bias and error in bins of binary fraction, with what is predicted for the same stacks.
 
     Parameters
@@ -121,6 +134,8 @@ def summarise(run: xr.Dataset, config: RunConfig, population: Population, bins: 
         Of the run.
     bins : int
         Number of equal ranges between 0 and 1 (count), at least 1.
+    integrals : PairIntegrals, optional
+        Of the population, where they are known already.
 
     Returns
     -------
@@ -143,7 +158,7 @@ def summarise(run: xr.Dataset, config: RunConfig, population: Population, bins: 
     fraction = run["binary_fraction"].to_numpy()
     edges = np.arange(bins + 1) / bins  # so that 0.35 is an edge of 20 bins
     which = np.clip(np.searchsorted(edges, fraction, side="right") - 1, 0, bins - 1)
-    curves = _at_stacks(population, config, fraction)
+    curves = _at_stacks(population, config, fraction, integrals)
     out = {name: np.full((len(config.psf), len(QUANTITIES), bins), np.nan) for name in STATISTICS}
     n_stacks, n_failed = np.bincount(which, minlength=bins), np.zeros((len(config.psf), bins), dtype=int)
     members = np.split(np.argsort(which, kind="stable"), np.cumsum(n_stacks)[:-1])
@@ -202,10 +217,12 @@ def rows(summary: xr.Dataset) -> list[dict[str, Any]]:
     ]
 
 
-def _at_stacks(population: Population, config: RunConfig, fraction: FloatArray) -> dict[str, FloatArray]:
+def _at_stacks(
+    population: Population, config: RunConfig, fraction: FloatArray, integrals: PairIntegrals | None
+) -> dict[str, FloatArray]:
     """Predicted bias and sd, (psf, quantity, stack)."""
     grid = np.unique(fraction) if np.ptp(fraction) == 0 else None
-    curves = predicted_curves(population, config, config.n_stars, grid)
+    curves = predicted_curves(population, config, config.n_stars, grid, integrals)
     nodes = curves["binary_fraction"].to_numpy()
     return {
         name: np.stack(
