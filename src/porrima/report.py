@@ -123,9 +123,10 @@ def _page(numbers: ErrorsAndBiases, figure: Figure) -> str:
 def _answer(numbers: ErrorsAndBiases) -> str:
     limit = numbers.limit.isel(psf=0).sel(quantity="r2").interp(binary_fraction=0.35)
     share = float(limit["bias"]) / KCM16.sigma_r2
+    models = f"{numbers.config.multiplicity.model}, {numbers.config.estimator} moments"
     return (
         f"With 35 % binaries the mean of x = f r²/(1 + f)² over the stars is {_power(numbers.mean_x)} arcsec², and the "
-        f"PSF of a stack comes out larger by {_power(float(limit['bias']))} ({numbers.config.estimator} moments): "
+        f"PSF of a stack comes out larger by {_power(float(limit['bias']))} ({models}): "
         f"{share:.0%} of the size requirement of {_power(KCM16.sigma_r2)}. More stars in the stack lower the scatter, "
         "not this bias."
     )
