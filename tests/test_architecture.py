@@ -50,8 +50,9 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "toy": {
         "errors", "figures", "files", "images", "instruments", "io", "moments", "psf", "response", "shapes", "systems",
     },
-    "pairs": {"elementary", "moments", "orbits", "streams"},
-    "stack": {"moments", "pairs", "photometry", "streams", "systems"},
+    "pairs": {"elementary", "orbits", "photometry", "streams", "systems"},
+    "blocks": {"elementary", "moments", "pairs"},
+    "stack": {"blocks", "elementary", "moments", "pairs", "streams", "systems"},
     "prediction": {"errors", "moments", "orbits", "photometry", "response", "systems"},
     "config": {"errors", "multiplicity", "photometry"},
     "sample": {"catalogs", "config", "errors", "galaxy", "stars", "systems"},
@@ -102,7 +103,7 @@ def reach(name, table):
 
 def is_compiled(node):
     """Compiled scalar functions say in one line what they take; their arguments have no types to check."""
-    return any("njit" in ast.unparse(d) for d in node.decorator_list)
+    return any(re.search(r"njit|^_step$|^_loop$", ast.unparse(d)) for d in node.decorator_list)
 
 
 def incomplete(node):

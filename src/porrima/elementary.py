@@ -11,19 +11,25 @@ from llvmlite import ir
 from numba import float32, int32, njit, types, uint32
 from numba.extending import intrinsic
 
-__all__ = ["centred", "exp2", "log2", "normal", "sine_cosine", "unit"]
+__all__ = [
+    "TAIL", "bits", "centred", "exp2", "from_bits", "log2", "normal", "normal_argument", "normal_centre", "normal_tail",
+    "sine_cosine", "unit",
+]  # fmt: skip
+
+TAIL = 5.0
+"""Argument from which a normal deviate is in the tail: |deviate| above 2.93, one of three hundred."""
 
 _CONTRACT = {"contract"}  # a product and a sum may fuse; nothing else of IEEE is relaxed
 
 
 @intrinsic
-def _bits(_context, _x):  # type: ignore[no-untyped-def]
+def bits(_context, _x):  # type: ignore[no-untyped-def]
     """Bits of a float32 as an int32."""
     return types.int32(types.float32), lambda _c, builder, _s, a: builder.bitcast(a[0], ir.IntType(32))
 
 
 @intrinsic
-def _from_bits(_context, _x):  # type: ignore[no-untyped-def]
+def from_bits(_context, _x):  # type: ignore[no-untyped-def]
     """Float32 with the bits of an int32."""
     return types.float32(types.int32), lambda _c, builder, _s, a: builder.bitcast(a[0], ir.FloatType())
 
@@ -81,9 +87,9 @@ _erfinv_tail = _polynomial(
 @njit(inline="always", fastmath=_CONTRACT)
 def log2(x):  # type: ignore[no-untyped-def]
     """Binary logarithm of a positive normal float32; absolute error below 1e-6 for x in (2^-24, 2)."""
-    bits = _bits(x)
-    exponent = (bits - int32(0x3F3504F3)) >> int32(23)
-    z = _from_bits(int32(bits - (exponent << int32(23)))) - float32(1)
+    word = bits(x)
+    exponent = (word - int32(0x3F3504F3)) >> int32(23)
+    z = from_bits(int32(word - (exponent << int32(23)))) - float32(1)
     return float32(exponent) + z * _log2_over_z(z)
 
 
@@ -92,7 +98,7 @@ def exp2(x):  # type: ignore[no-untyped-def]
     """Two to the power of a float32 up to 127, at least 2^-126; relative error below 2e-7 where x is exact."""
     x = max(x, float32(-126.0))
     whole = np.floor(x + float32(0.5))
-    return _exp2_near_0(x - whole) * _from_bits(int32((int32(whole) + int32(127)) << int32(23)))
+    return _exp2_near_0(x - whole) * from_bits(int32((int32(whole) + int32(127)) << int32(23)))
 
 
 @njit(inline="always", fastmath=_CONTRACT)
@@ -103,16 +109,31 @@ def sine_cosine(t):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=_CONTRACT)
+def normal_argument(x):  # type: ignore[no-untyped-def]
+    """-ln(1 - x^2), which the normal deviate of x is a function of; from `TAIL` on it is in the tail."""
+    return float32(-0.6931471805599453) * log2((float32(1) - x) * (float32(1) + x))
+
+
+@njit(inline="always", fastmath=_CONTRACT)
+def normal_centre(x, w):  # type: ignore[no-untyped-def]
+    """Standard normal deviate with cumulative probability (1 + x)/2 and w = `normal_argument` below `TAIL`."""
+    return float32(1.4142135623730951) * x * _erfinv_centre(w - float32(2.5))
+
+
+@njit(inline="always", fastmath=_CONTRACT)
+def normal_tail(x, w):  # type: ignore[no-untyped-def]
+    """The same for w from `TAIL` on."""
+    return float32(1.4142135623730951) * x * _erfinv_tail(np.sqrt(w) - float32(3))
+
+
+@njit(inline="always", fastmath=_CONTRACT)
 def normal(x):  # type: ignore[no-untyped-def]
     """Standard normal deviate with cumulative probability (1 + x)/2, x a float32 in (-1, 1).
 
-    The inverse error function of Giles (2010), single precision, both its branches evaluated: relative error
-    below 1e-6 where x itself is exact.
+    The inverse error function of Giles (2010), single precision: relative error below 1e-6 where x itself is exact.
     """
-    w = float32(-0.6931471805599453) * log2((float32(1) - x) * (float32(1) + x))
-    centre = _erfinv_centre(w - float32(2.5))
-    tail = _erfinv_tail(np.sqrt(w) - float32(3))
-    return float32(1.4142135623730951) * x * (centre if w < float32(5) else tail)
+    w = normal_argument(x)
+    return normal_centre(x, w) if w < float32(TAIL) else normal_tail(x, w)
 
 
 @njit(inline="always")

@@ -8,33 +8,29 @@ on the seed and its number alone.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numba import njit, prange
-from scipy.special import ndtr
 
-from porrima.moments import INDICES, N_MOMENTS, KernelMoments
-from porrima.pairs import (
+from porrima.blocks import (
+    BLOCK_SIZE,
     FLUX_RATIO,
-    FRACTION,
     KEPT,
     LANES,
-    SEPARATION,
-    VALID,
-    WEIGHT,
-    Tables,
     X,
     Y,
-    alias_table,
     draw_block,
     flush,
-    scratch,
+    keep_block,
+    keep_lanes,
     sum_block,
-)  # fmt: skip
-from porrima.photometry import STEP, magnitudes
+    weigh_block,
+)
+from porrima.elementary import bits
+from porrima.moments import INDICES, N_MOMENTS, KernelMoments
+from porrima.pairs import CUT, FRACTION, LAW, tables_of
 from porrima.streams import binomial, philox, uniform_pair
 from porrima.systems import Systems
 
@@ -50,11 +46,15 @@ __all__ = ["BinaryFraction", "Stacks", "draw_stacks", "draw_systems"]
 BinaryFraction = float | Literal["uniform", "model"]
 """A number in [0, 1], ``uniform`` for one in (0, 1) per stack, ``model`` for the multiplicity model's own."""
 
-_FRACTION, _COUNT, _PAIR, _SINGLE = 0, 1, 2, 3  # the stages of a stack, each with a stream of its own
+_FRACTION, _COUNT, _SINGLE = (
+    0,
+    1,
+    3,
+)  # stages of a stack, each with a stream of its own; 2 and 4 are in `pairs`
 _MAX_SEED = 2**64
 _MOST_TRIES = 10_000  # pairs drawn for each star of a stack before it is given up: all are resolved
 _BATCH = 64  # stacks that share one thread's room
-_BLOCKS_IN_FLOAT32 = 8  # sums of more blocks than these go on in float64
+_BLOCKS_IN_FLOAT32 = 32  # sums of more blocks than these go on in float64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,8 +110,8 @@ def draw_stacks(
     fractions = _fractions(population, n_stars, binary_fraction, seed, first, last)
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(last - first)
     sums = np.zeros((last - first, N_MOMENTS))
-    unit = np.array([population.cut ** (a + b) for a, b in INDICES])
-    _fill(_tables(population), np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
+    unit = np.array([(population.cut / CUT) ** (a + b) for a, b in INDICES])
+    _fill(tables_of(population), np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
     if np.any(np.isnan(sums[:, 0])):
         raise ValueError(
             f"cut must leave some pairs unresolved at this binary fraction, got {population.cut}"
@@ -147,12 +147,12 @@ def draw_systems(
     """
     fractions = _fractions(population, n_stars, binary_fraction, seed, stack, stack + 1)
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(1)
-    listed, sums = np.zeros((n_stars, 4)), np.zeros(N_MOMENTS)
-    _draw_stack(
-        _tables(population), scratch(), np.uint64(seed), stack, n_stars, fractions[0], scale[0], sums, listed
-    )
+    listed, sums = np.full((n_stars, 4), -1.0), np.zeros(N_MOMENTS)
+    block, key = np.zeros(BLOCK_SIZE, np.float32), np.uint64(seed)
+    _draw_stack(tables_of(population), block, key, stack, n_stars, fractions[0], scale[0], sums, listed)
     flux_ratio, dx, dy, weight = listed.T
-    return Systems.from_pairs(flux_ratio, dx * population.cut, dy * population.cut, weight)
+    unit = population.cut / CUT
+    return Systems.from_pairs(flux_ratio, dx * unit, dy * unit, weight)
 
 
 def _fractions(
@@ -176,44 +176,6 @@ def _fractions(
     return np.full(last - first, float(binary_fraction))
 
 
-def _tables(population: Population) -> Tables:
-    law, tracks, stars = population.law, population.tracks, population.stars
-    offset = tracks.index[0] - tracks.index[0, 0]
-    if np.any(tracks.index - tracks.index[:, :1] != offset):
-        raise ValueError(f"tracks must lie alike for all stars, got {tracks.index}")
-    given = ~np.isnan(law.mass_ratio)
-    g = law.mass_ratio_exponent + 1
-    power_law = (np.abs(g) > 1e-9) & ~given
-    log2_10, magnitude_to_log2 = math.log2(10.0), -0.4 * math.log2(10.0)
-    columns = [
-        (law.log_a - np.log10(stars.distance)) * log2_10 - math.log2(population.cut),  # au / pc = arcsec
-        law.log_a_sigma * log2_10,
-        ndtr((law.log_a_max - law.log_a) / law.log_a_sigma),
-        np.divide(1.0, g, out=np.zeros_like(g), where=power_law),
-        np.where(power_law, law.mass_ratio_min ** np.where(power_law, g, 1.0), 1.0),
-        np.where(power_law | given, 0.0, np.log2(law.mass_ratio_min)),
-        np.log2(stars.mass * np.where(given, law.mass_ratio, 1.0)),
-        magnitudes(tracks, stars.mass[:, None])[:, 0] * magnitude_to_log2,
-        *tracks.weight.T,
-        tracks.index[:, 0],
-        population.weight,
-        law.multiplicity_fraction,
-    ]
-    stay, alias = alias_table(law.multiplicity_fraction)
-    return Tables(
-        star=np.stack(columns, axis=1).astype(np.float32),
-        grid=(tracks.magnitude * magnitude_to_log2).astype(np.float32),
-        grid_start=np.float32(tracks.log_mass_min * log2_10),
-        grid_step=np.float32(STEP * log2_10),
-        track_offset=offset.astype(np.int32),
-        log_dark=np.float32(math.log2(tracks.dark_below) if tracks.dark_below > 0 else -math.inf),
-        isotropic=population.projection == "isotropic",
-        equal_weights=bool(np.all(population.weight == 1.0)),
-        stay=stay,
-        alias=alias,
-    )
-
-
 @njit(inline="always")
 def _halves(number):  # type: ignore[no-untyped-def]
     """Low and high 32 bits of a number."""
@@ -229,9 +191,11 @@ def _uniform_fractions(seed, first, fractions):  # type: ignore[no-untyped-def]
         fractions[s] = uniform_pair(words[0], words[1])
 
 
-@njit
+@njit(forceinline=True, _nrt=False)
 def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, listed):  # type: ignore[no-untyped-def]
-    """Mean moments of one stack in `sums`, lengths over the cut; its systems in `listed` where that has rows.
+    """Sum of the weights of one stack, with those of its moments, in the unit of length, in `sums`.
+
+    Its systems are listed where `listed` has rows.
 
     The pairs of a stack are one stream.  As many are taken as the binomial draw says; for each that is resolved
     another star is drawn, which is a pair with the same probability, until none is.
@@ -239,73 +203,82 @@ def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, list
     key_low, key_high = _halves(seed)
     low, high = _halves(stack)
     wanted, draw = binomial(n_stars, fraction, key_low, key_high, _COUNT, low, high, 0)
-    pair = block.pair
-    taken, filled, resolved, kept, total, lane = 0, 0, 0, 0, 0.0, LANES
+    n_blocks, resolved, kept, total, lane = 0, 0, 0, 0.0, LANES
     while wanted > 0:
-        if taken > _MOST_TRIES * (n_stars + 100):
-            sums[:] = np.nan
-            return
         if lane == LANES:
-            if taken > 0:
-                sum_block(pair, block.sums)
-                filled += 1
-                if filled % _BLOCKS_IN_FLOAT32 == 0:
-                    flush(block.sums, sums)
-            draw_block(tables, block, scale, key_low, key_high, _PAIR, low, high, taken)
-            lane = 0
-        if pair[VALID + lane] > np.float32(0):
-            wanted -= 1
-            if pair[SEPARATION + lane] >= np.float32(1):
-                resolved += 1
-            else:
-                weight = block.star[WEIGHT + lane]
-                pair[KEPT + lane] = weight
-                total += weight
-                if listed.shape[0] > 0:
-                    listed[kept, 0], listed[kept, 3] = pair[FLUX_RATIO + lane], weight
-                    listed[kept, 1], listed[kept, 2] = pair[X + lane], pair[Y + lane]
-                kept += 1
-        lane += 1
-        taken += 1
+            if n_blocks > 0:
+                total += _add_block(tables.weight, block, listed)
+                if n_blocks % _BLOCKS_IN_FLOAT32 == 0:
+                    flush(block, sums)
+            if n_blocks * LANES > _MOST_TRIES * (n_stars + 100):
+                return np.nan
+            draw_block(tables, block, scale, key_low, key_high, low, high, n_blocks * LANES)
+            n_blocks, lane = n_blocks + 1, 0
+        if lane == 0 and wanted >= LANES:
+            n_valid, n_kept = keep_block(block)
+            lane = LANES
+        else:
+            lane, n_valid, n_kept = keep_lanes(block, lane, wanted)
+        wanted, resolved, kept = wanted - n_valid, resolved + n_valid - n_kept, kept + n_kept
         if wanted == 0 and resolved > 0:
             wanted, draw = binomial(resolved, fraction, key_low, key_high, _COUNT, low, high, draw)
             resolved = 0
-    if taken > 0:
-        sum_block(block.pair, block.sums)
-        flush(block.sums, sums)
-    total += _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, listed)
-    for k in range(sums.size):
-        sums[k] /= total
+    if n_blocks > 0:
+        total += _add_block(tables.weight, block, listed)
+        flush(block, sums)
+    if tables.weight.size == 0 and listed.shape[0] == 0:  # single stars cost nothing
+        return float(n_stars)
+    return total + _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, listed)
 
 
-@njit
+@njit(forceinline=True, _nrt=False)
+def _add_block(weight, block, listed):  # type: ignore[no-untyped-def]
+    """Add the moments of the kept pairs of a block and list them below the last one; their weight, where weighed."""
+    total = weigh_block(weight, block) if weight.size > 0 else 0.0
+    sum_block(block)
+    if listed.shape[0] > 0:
+        row = 0
+        while row < listed.shape[0] and listed[row, 0] >= 0.0:
+            row += 1
+        for lane in range(LANES):
+            if block[KEPT + lane] > np.float32(0):
+                listed[row, 0], listed[row, 3] = block[FLUX_RATIO + lane], block[KEPT + lane]
+                listed[row, 1], listed[row, 2] = block[X + lane], block[Y + lane]
+                row += 1
+    return total
+
+
+@njit(_nrt=False)
 def _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, listed):  # type: ignore[no-untyped-def]
     """Total weight of the single stars of a stack, each listed where `listed` has rows."""
-    if tables.equal_weights and listed.shape[0] == 0:  # single stars cost nothing
-        return float(n_stars - kept)
     total, draw = 0.0, 0
     for single in range(kept, n_stars):
         weight = 1.0
-        while not tables.equal_weights:  # any star, kept with its probability of being single
+        while tables.weight.size > 0:  # any star, kept with its probability of being single
             words = philox(key_low, key_high, draw, _SINGLE, low, high)
             draw += 1
-            star = tables.star[int((np.uint64(words[0]) * np.uint64(tables.stay.size)) >> np.uint64(32))]
-            if uniform_pair(words[1], words[2]) >= scale * star[FRACTION // LANES]:
-                weight = float(star[WEIGHT // LANES])
+            star = int((np.uint64(words[0]) * np.uint64(tables.stay.size)) >> np.uint64(32))
+            law = bits(tables.star[star, LAW])
+            if uniform_pair(words[1], words[2]) >= scale * tables.law[law, FRACTION]:
+                weight = float(tables.weight[star])
                 break
         total += weight
         if listed.shape[0] > 0:
-            listed[single, 3] = weight
+            listed[single, 0], listed[single, 3] = 0.0, weight
     return total
 
 
 @njit(cache=True, parallel=True)
 def _fill(tables, seed, first, n_stars, fractions, scale, unit, sums):  # type: ignore[no-untyped-def]
-    """Stacks of a range, a few at a time on each thread; `unit` turns lengths over the cut to arcsec."""
+    """Stacks of a range, a few at a time on each thread; `unit` turns lengths to arcsec."""
     n_batches = (fractions.size + _BATCH - 1) // _BATCH
     for batch in prange(n_batches):
-        block, listed = scratch(), np.empty((0, 4))
+        block = np.zeros(BLOCK_SIZE, np.float32)
+        listed = np.empty((0, 4))
         for s in range(batch * _BATCH, min((batch + 1) * _BATCH, fractions.size)):
-            _draw_stack(tables, block, seed, first + s, n_stars, fractions[s], scale[s], sums[s], listed)
+            total = _draw_stack(
+                tables, block, seed, first + s, n_stars, fractions[s], scale[s], sums[s], listed
+            )
+            norm = 1.0 / total
             for k in range(sums.shape[1]):
-                sums[s, k] *= unit[k]
+                sums[s, k] *= unit[k] * norm

@@ -9,21 +9,20 @@ from __future__ import annotations
 
 import math
 
-from numba import njit, uint32, uint64
+from numba import int32, njit, uint32, uint64
 
 __all__ = ["binomial", "philox", "uniform_pair"]
 
 
+_LOW = uint64(0xFFFFFFFF)
+
+
 @njit(inline="always")
 def _round(x0, x1, x2, x3, k0, k1):  # type: ignore[no-untyped-def]
-    p0 = uint64(0xD2511F53) * uint64(x0)
-    p1 = uint64(0xCD9E8D57) * uint64(x2)
-    return (
-        uint32(uint32(p1 >> uint64(32)) ^ x1 ^ k0),
-        uint32(p1),
-        uint32(uint32(p0 >> uint64(32)) ^ x3 ^ k1),
-        uint32(p0),
-    )
+    """One round on words in the lower halves of uint64: what is above them is never read."""
+    p0 = (x0 & _LOW) * uint64(0xD2511F53)
+    p1 = (x2 & _LOW) * uint64(0xCD9E8D57)
+    return (p1 >> uint64(32)) ^ x1 ^ uint64(k0), p1, (p0 >> uint64(32)) ^ x3 ^ uint64(k1), p0
 
 
 @njit(inline="always")
@@ -40,13 +39,14 @@ def _two_rounds(x0, x1, x2, x3, k0, k1):  # type: ignore[no-untyped-def]
 def philox(key_low, key_high, c0, c1, c2, c3):  # type: ignore[no-untyped-def]
     """Four 32-bit words of Philox 4x32-10 for one key and counter (all uint32)."""
     k0, k1 = uint32(key_low), uint32(key_high)
-    x0, x1, x2, x3 = _round(uint32(c0), uint32(c1), uint32(c2), uint32(c3), k0, k1)
+    x0, x1, x2, x3 = _round(uint64(c0), uint64(c1), uint64(c2), uint64(c3), k0, k1)
     x0, x1, x2, x3, k0, k1 = _two_rounds(x0, x1, x2, x3, k0, k1)  # written out: a loop would not vectorise
     x0, x1, x2, x3, k0, k1 = _two_rounds(x0, x1, x2, x3, k0, k1)
     x0, x1, x2, x3, k0, k1 = _two_rounds(x0, x1, x2, x3, k0, k1)
     x0, x1, x2, x3, k0, k1 = _two_rounds(x0, x1, x2, x3, k0, k1)
     k0, k1 = uint32(k0 + uint32(0x9E3779B9)), uint32(k1 + uint32(0xBB67AE85))
-    return _round(x0, x1, x2, x3, k0, k1)
+    x0, x1, x2, x3 = _round(x0, x1, x2, x3, k0, k1)
+    return uint32(x0), uint32(x1), uint32(x2), uint32(x3)
 
 
 @njit(inline="always")
@@ -56,13 +56,35 @@ def uniform_pair(high, low):  # type: ignore[no-untyped-def]
     return (bits + 0.5) * 2.220446049250313e-16
 
 
+_FEW = 128
+"""Most trials made one by one (count)."""
+
+
+@njit
+def _trials(n, p, key_low, key_high, stage, stack_low, stack_high, draw):  # type: ignore[no-untyped-def]
+    """Binomial count for a few trials, and the next free draw number: a trial succeeds where its word is below p."""
+    below, count, calls = uint64(p * 4294967296.0), int32(0), int32((n + 3) // 4)
+    for call in range(calls):
+        words = philox(key_low, key_high, uint32(draw + call), stage, stack_low, stack_high)
+        left = int32(n - 4 * call)
+        count += int32((left > 0) & (uint64(words[0]) < below)) + int32(
+            (left > 1) & (uint64(words[1]) < below)
+        )
+        count += int32((left > 2) & (uint64(words[2]) < below)) + int32(
+            (left > 3) & (uint64(words[3]) < below)
+        )
+    return int(count), draw + calls
+
+
 @njit
 def binomial(n, p, key_low, key_high, stage, stack_low, stack_high, draw):  # type: ignore[no-untyped-def]
     """Binomial count for n trials of probability p, and the next free draw number of the stream.
 
-    Small means by inversion, large ones by transformed rejection (BTRS, Hoermann 1993); both exact to the
-    resolution of the uniforms.
+    A few trials are made one by one, four to a call of the generator; of many, small means come by inversion, large
+    ones by transformed rejection (BTRS, Hoermann 1993).  All are exact to the resolution of the uniforms.
     """
+    if n <= _FEW:
+        return _trials(n, p, key_low, key_high, stage, stack_low, stack_high, draw)
     flipped = p > 0.5
     p = 1.0 - p if flipped else p
     if n * p < 10.0:

@@ -31,7 +31,7 @@ BRIGHT_MASS = 1.5
 """Largest mass of a star kept, in M_sun: multiplicity is badly known above (KCM16 Sect. 4.3)."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Population:
     """Stars with the law of their companions, and when a survey resolves a pair: what systems are drawn from.
 

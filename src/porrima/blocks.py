@@ -1,0 +1,342 @@
+"""Thirty-two pairs at a time: the steps of `pairs` in loops that a CPU's compiler turns into vector instructions.
+
+Each step is a loop over the lanes of a block.  What a pair needs of its star, law and tracks stands in rows of eight
+numbers, which are loaded whole and turned into lanes in registers, where a gather would load every number alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import float32, int32, njit, types, uint32
+from numba.core.errors import TypingError
+from numba.extending import intrinsic
+
+from porrima.elementary import TAIL, bits, from_bits, normal_argument, normal_centre, normal_tail
+from porrima.moments import N_MOMENTS
+from porrima.pairs import (
+    BASE,
+    CUT,
+    FLUX,
+    FRACTION,
+    LAW,
+    MASS,
+    Q_FLAT,
+    Q_SLOPE,
+    Q_START,
+    SIGMA,
+    TRUNCATION,
+    W1,
+    W2,
+    W3,
+    WIDTH,
+    A,
+    add_moments,
+    axis_argument,
+    companion_mass,
+    direction,
+    flux_ratio,
+    is_too_many,
+    phase_word,
+    place_on_track,
+    primary,
+    random_words,
+    separation,
+)  # fmt: skip
+
+__all__ = [
+    "BLOCK_SIZE",
+    "LANES",
+    "draw_block",
+    "flush",
+    "keep_block",
+    "keep_lanes",
+    "sum_block",
+    "weigh_block",
+]
+
+LANES = 32
+"""Pairs in a block: enough for a CPU to work on four vectors of eight at once."""
+
+_SUM_LANES = 8
+_TURNED = 16  # rows turned into columns at a time
+
+X, Y, SEPARATION, FLUX_RATIO, KEPT, VALID = (row * LANES for row in range(6))
+"""Rows of a block: companion from primary and the length of that in `pairs.CUT`, flux ratio, weight in the stack (0
+where the pair is resolved or not wanted), and 1, or 0 where there are too many of its star."""
+
+_MASS, _PLACE, _NUMBER, _ROW_NUMBER, _AXIS, _TAIL_X, _TAIL_W = (row * LANES for row in range(6, 13))
+"""More rows: log2 of the companion's mass and its place on the grid; as bits, the number of the star and of a row to
+look up; log2 of the semi-major axis and what it follows from."""
+
+_STAR, _LAW, _TRACK, _WORD = (row * LANES for row in (13, 13 + WIDTH, 13 + 2 * WIDTH, 13 + 3 * WIDTH))
+"""Rows of a block: columns of its rows of the tables, and five random words as bits."""
+
+_SUMS = (13 + 3 * WIDTH + 5) * LANES
+"""Sums of the moments of all blocks that wait to be flushed, rows of `_SUM_LANES`."""
+
+BLOCK_SIZE = _SUMS + N_MOMENTS * _SUM_LANES
+"""Numbers in a block: one flat array, since with distances that it knows the compiler vectorises without asking."""
+
+
+def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
+    """Columns of sixteen rows of eight, as vectors of sixteen, in three rounds of exchanges between registers."""
+
+    def mixed(a: Any, b: Any, lanes: list[int]) -> Any:
+        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), _TURNED), lanes))
+
+    lanes = range(_TURNED)
+    columns = [mixed(rows[k], rows[k + WIDTH], list(lanes)) for k in range(WIDTH)]
+    for step in (1, 2, 4):
+        for k in (k for k in range(WIDTH) if not k & step):
+            a, b = columns[k], columns[k + step]
+            columns[k] = mixed(a, b, [j if not j & step else _TURNED + j - step for j in lanes])
+            columns[k + step] = mixed(a, b, [j + step if not j & step else _TURNED + j for j in lanes])
+    return columns
+
+
+@intrinsic
+def _take_rows(_context, table, block, number, place):  # type: ignore[no-untyped-def]
+    """The rows of a table whose numbers stand (as bits) in a row of the block, turned into columns at `place`."""
+    if table.layout != "C":
+        raise TypingError(f"table must be contiguous by rows, got {table}")
+    word = ir.IntType(64)
+
+    def code(context, builder, _signature, arguments):  # type: ignore[no-untyped-def]
+        source, target = (
+            context.make_array(kind)(context, builder, argument).data
+            for kind, argument in zip((table, block), arguments[:2], strict=True)
+        )
+        first, to = (context.cast(builder, argument, kind, types.int64)
+                     for argument, kind in zip(arguments[2:], (number, place), strict=True))  # fmt: skip
+
+        def at(array: Any, index: Any, kind: Any) -> Any:
+            return builder.bitcast(builder.gep(array, [index]), kind.as_pointer())
+
+        def row(lane: int) -> Any:
+            where = builder.load(at(target, builder.add(first, word(lane)), ir.IntType(32)))
+            start = builder.mul(builder.zext(where, word), word(WIDTH))
+            return builder.load(at(source, start, ir.VectorType(ir.FloatType(), WIDTH)), align=4)
+
+        for lane in range(0, LANES, _TURNED):
+            columns = _transposed(builder, [row(lane + k) for k in range(_TURNED)])
+            for k, column in enumerate(columns):
+                start = builder.add(to, word(k * LANES + lane))
+                builder.store(column, at(target, start, column.type), align=4)
+        return context.get_dummy_value()
+
+    return types.void(table, block, number, place), code
+
+
+@intrinsic
+def _take_sum(_context, block, row):  # type: ignore[no-untyped-def]
+    """Sum over the lanes of a row, halves added to halves; the row is set to zero."""
+
+    def code(context, builder, _signature, arguments):  # type: ignore[no-untyped-def]
+        array = context.make_array(block)(context, builder, arguments[0]).data
+        lanes = ir.VectorType(ir.FloatType(), _SUM_LANES)
+        start = context.cast(builder, arguments[1], row, types.int64)
+        pointer = builder.bitcast(builder.gep(array, [start]), lanes.as_pointer())
+        total, size = builder.load(pointer, align=4), _SUM_LANES
+        while size > 1:
+            size //= 2
+            low, high = (
+                ir.Constant(ir.VectorType(ir.IntType(32), size), list(range(first, first + size)))
+                for first in (0, size)
+            )
+            total = builder.fadd(
+                builder.shuffle_vector(total, total, low), builder.shuffle_vector(total, total, high)
+            )
+        builder.store(ir.Constant(lanes, [0.0] * _SUM_LANES), pointer, align=4)
+        return builder.extract_element(total, ir.Constant(ir.IntType(32), 0))
+
+    return types.float32(block, row), code
+
+
+_loop = njit(forceinline=True, _nrt=False, fastmath={"contract"}, error_model="numpy")
+
+
+@_loop
+def _draw_words(isotropic, block, key_low, key_high, stack_low, stack_high, first):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        words = random_words(key_low, key_high, stack_low, stack_high, uint32(first + lane))
+        block[_WORD + lane] = from_bits(int32(words[0]))
+        block[_WORD + LANES + lane] = from_bits(int32(words[1]))
+        block[_WORD + 2 * LANES + lane] = from_bits(int32(words[2]))
+        block[_WORD + 3 * LANES + lane] = from_bits(int32(words[3]))
+    if not isotropic:
+        for lane in range(LANES):
+            word = phase_word(key_low, key_high, stack_low, stack_high, uint32(first + lane))
+            block[_WORD + 4 * LANES + lane] = from_bits(int32(word))
+
+
+@_loop
+def _primaries(stay, alias, block):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        block[_NUMBER + lane] = from_bits(int32(primary(uint32(bits(block[_WORD + lane])), stay, alias)))
+
+
+@_loop
+def _laws(block):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        block[_ROW_NUMBER + lane] = block[_STAR + LAW * LANES + lane]
+
+
+@_loop
+def _axes(block):  # type: ignore[no-untyped-def]
+    """Binary logarithm of the semi-major axes; the tail of the normal law only where a lane is in it."""
+    tails = int32(0)
+    for lane in range(LANES):
+        x = axis_argument(
+            uint32(bits(block[_WORD + 2 * LANES + lane])), block[_LAW + TRUNCATION * LANES + lane]
+        )
+        w = normal_argument(x)
+        block[_TAIL_X + lane], block[_TAIL_W + lane] = x, w
+        tails |= int32(w >= float32(TAIL))
+        block[_AXIS + lane] = block[_STAR + A * LANES + lane] + block[
+            _LAW + SIGMA * LANES + lane
+        ] * normal_centre(x, w)
+    if tails != 0:
+        for lane in range(LANES):
+            x, w = block[_TAIL_X + lane], block[_TAIL_W + lane]
+            far = block[_STAR + A * LANES + lane] + block[_LAW + SIGMA * LANES + lane] * normal_tail(x, w)
+            block[_AXIS + lane] = block[_AXIS + lane] if w < float32(TAIL) else far
+
+
+@_loop
+def _separations(isotropic, block):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        turn = uint32(bits(block[_WORD + 3 * LANES + lane]))
+        r = separation(isotropic, block[_AXIS + lane], turn, uint32(bits(block[_WORD + 4 * LANES + lane])))
+        cosine, sine = direction(turn)
+        block[X + lane], block[Y + lane], block[SEPARATION + lane] = r * cosine, r * sine, r
+
+
+@_loop
+def _companion_masses(block):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        block[_MASS + lane] = companion_mass(
+            uint32(bits(block[_WORD + LANES + lane])), block[_STAR + MASS * LANES + lane],
+            block[_LAW + Q_SLOPE * LANES + lane], block[_LAW + Q_START * LANES + lane],
+            block[_LAW + Q_FLAT * LANES + lane],
+        )  # fmt: skip
+
+
+@_loop
+def _places(start, per_unit, n_grid, block):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        k, t = place_on_track(block[_MASS + lane], start, per_unit, n_grid)
+        row = bits(block[_STAR + BASE * LANES + lane]) * int32(n_grid) + k
+        block[_ROW_NUMBER + lane], block[_PLACE + lane] = from_bits(int32(row)), t
+
+
+@_loop
+def _flux_ratios(log_dark, block):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        star, track = _STAR + lane, _TRACK + lane
+        block[FLUX_RATIO + lane] = flux_ratio(
+            block[star + W1 * LANES], block[star + W2 * LANES], block[star + W3 * LANES], block[_PLACE + lane],
+            block[track], block[track + LANES], block[track + 2 * LANES], block[track + 3 * LANES],
+            block[track + 4 * LANES], block[track + 5 * LANES], block[track + 6 * LANES],
+            block[track + 7 * LANES], block[star + FLUX * LANES], block[_MASS + lane] < log_dark,
+        )  # fmt: skip
+
+
+@_loop
+def _validity(scale, is_capped, block):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        block[KEPT + lane], block[VALID + lane] = float32(0), float32(1)
+    if is_capped:
+        for lane in range(LANES):
+            mass_word = uint32(bits(block[_WORD + LANES + lane]))
+            axis_word = uint32(bits(block[_WORD + 2 * LANES + lane]))
+            gone = is_too_many(mass_word, axis_word, scale, block[_LAW + FRACTION * LANES + lane])
+            block[VALID + lane] = float32(0) if gone else float32(1)
+
+
+@_loop
+def draw_numbers(tables, block, key_low, key_high, stack_low, stack_high, first):  # type: ignore[no-untyped-def]
+    """The random part of `draw_block` alone, with whatever stars and laws the block holds: the least it can cost."""
+    _draw_words(tables.isotropic, block, key_low, key_high, stack_low, stack_high, first)
+    _primaries(tables.stay, tables.alias, block)
+    _axes(block)
+    _separations(tables.isotropic, block)
+    _companion_masses(block)
+
+
+@_loop
+def draw_block(tables, block, scale, key_low, key_high, stack_low, stack_high, first):  # type: ignore[no-untyped-def]
+    """Draw the pairs of one block, none of them kept yet; `first` is the number of the first in its stack."""
+    _draw_words(tables.isotropic, block, key_low, key_high, stack_low, stack_high, first)
+    _primaries(tables.stay, tables.alias, block)
+    _take_rows(tables.star, block, _NUMBER, _STAR)
+    _laws(block)
+    _take_rows(tables.law, block, _ROW_NUMBER, _LAW)
+    _axes(block)
+    _separations(tables.isotropic, block)
+    _companion_masses(block)
+    _places(tables.grid_start, tables.grid_per_unit, tables.n_grid, block)
+    _take_rows(tables.track, block, _ROW_NUMBER, _TRACK)
+    _flux_ratios(tables.log_dark, block)
+    _validity(scale, scale * tables.largest_fraction > 1.0, block)
+
+
+@_loop
+def keep_block(block):  # type: ignore[no-untyped-def]
+    """Keep every valid pair of a block that is not resolved; how many are valid, and how many of them kept."""
+    valid, kept = int32(0), int32(0)
+    for lane in range(LANES):
+        is_valid = block[VALID + lane] > float32(0)
+        is_kept = is_valid and block[SEPARATION + lane] < float32(CUT)
+        block[KEPT + lane] = float32(1) if is_kept else float32(0)
+        valid += int32(is_valid)
+        kept += int32(is_kept)
+    return valid, kept
+
+
+@_loop
+def keep_lanes(block, lane, wanted):  # type: ignore[no-untyped-def]
+    """The same from a lane on for as many valid pairs as are wanted; the next lane, how many are valid, and kept."""
+    valid, kept = int32(0), int32(0)
+    while lane < LANES and valid < wanted:
+        is_valid = block[VALID + lane] > float32(0)
+        is_kept = is_valid & (block[SEPARATION + lane] < float32(CUT))
+        block[KEPT + lane] = float32(is_kept)
+        valid += int32(is_valid)
+        kept += int32(is_kept)
+        lane += 1
+    return lane, valid, kept
+
+
+@_loop
+def weigh_block(weight, block):  # type: ignore[no-untyped-def]
+    """Total weight of the kept pairs of a block, each given that of its star."""
+    total = 0.0
+    for lane in range(LANES):
+        block[KEPT + lane] *= weight[bits(block[_NUMBER + lane])]
+        total += block[KEPT + lane]
+    return total
+
+
+@_loop
+def sum_block(block):  # type: ignore[no-untyped-def]
+    """Add the kernel moments of the kept pairs of a block, each fourth of its lanes to the same sums."""
+    for lane in range(_SUM_LANES):
+        _add_lane(block, lane, lane)
+        _add_lane(block, lane + _SUM_LANES, lane)
+        _add_lane(block, lane + 2 * _SUM_LANES, lane)
+        _add_lane(block, lane + 3 * _SUM_LANES, lane)
+
+
+@njit(inline="always", _nrt=False)
+def _add_lane(block, lane, to):  # type: ignore[no-untyped-def]
+    kept, f, x, y = block[KEPT + lane], block[FLUX_RATIO + lane], block[X + lane], block[Y + lane]
+    add_moments(block, _SUMS + to, _SUM_LANES, kept, f, x, y)
+
+
+@_loop
+def flush(block, total):  # type: ignore[no-untyped-def]
+    """Move the sums of a block to one float64 total per moment."""
+    for k in range(N_MOMENTS):
+        total[k] += _take_sum(block, _SUMS + k * _SUM_LANES)
