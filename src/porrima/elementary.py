@@ -50,13 +50,13 @@ def floor(_context, _x):  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def larger(a, b):  # type: ignore[no-untyped-def]
     """The larger of two numbers (the built-in function is not compiled for every GPU target)."""
-    return a if a > b else b
+    return b if b > a else a
 
 
 @njit(inline="always")
 def smaller(a, b):  # type: ignore[no-untyped-def]
     """The smaller of two numbers."""
-    return a if a < b else b
+    return b if b < a else a
 
 
 def _polynomial(*coefficients: float):  # type: ignore[no-untyped-def]

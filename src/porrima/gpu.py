@@ -7,10 +7,12 @@ stack has the same pairs on both; its moments differ by what rounding makes of f
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import config, cuda, float32, float64, int32, njit, uint32
+from numba.core.errors import NumbaPerformanceWarning
 
 from porrima.elementary import bits, normal
 from porrima.errors import InputError
@@ -59,7 +61,7 @@ _THREADS = 128  # of a block
 _MOST_STACKS = 2**18  # on the device at once: 100 MB
 _PAIRS_IN_FLOAT32 = 128  # sums of more pairs than these go on in float64, as on a CPU
 
-_REGISTERS = 96  # of a thread: the fewest with which the loop over pairs keeps all of its numbers in them
+_REGISTERS = 96  # of a thread: the loop over pairs spills none, and five blocks share a multiprocessor
 
 _OPTIONS = {} if config.ENABLE_CUDASIM else {"max_registers": _REGISTERS}  # the simulator has none
 
@@ -109,14 +111,15 @@ def fill(
         raise InputError(
             "no CUDA device found: it takes an NVIDIA GPU, its driver and the CUDA toolkit", key="device"
         )
-    on_device = _on_device(tables)
+    on_device, stacks = _on_device(tables), first + np.arange(fractions.size)
     order = np.argsort(-fractions, kind="stable")
     for start in range(0, order.size, _MOST_STACKS):
         part = order[start : start + _MOST_STACKS]
         drawn = cuda.device_array((N_MOMENTS + 1, part.size))
-        _kernel[-(-part.size // _THREADS), _THREADS](
-            on_device, np.uint64(seed), n_stars, first + part, fractions[part], scale[part], drawn
-        )
+        columns = (cuda.to_device(column[part]) for column in (stacks, fractions, scale))
+        with warnings.catch_warnings():  # few stacks are no mistake
+            warnings.simplefilter("ignore", NumbaPerformanceWarning)
+            _kernel[-(-part.size // _THREADS), _THREADS](on_device, np.uint64(seed), n_stars, *columns, drawn)
         *moments, weight = drawn.copy_to_host()
         sums[part] = np.transpose(moments / weight) * unit
 
