@@ -6,14 +6,16 @@ test; they are near the rounding of float32 and the resolution of the uniform nu
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from llvmlite import ir
 from numba import float32, int32, njit, types, uint32
 from numba.extending import intrinsic
 
 __all__ = [
-    "TAIL", "bits", "centred", "exp2", "from_bits", "log2", "normal", "normal_argument", "normal_centre", "normal_tail",
-    "sine_cosine", "unit",
+    "TAIL", "bits", "centred", "exp2", "floor", "from_bits", "larger", "log2", "normal", "normal_argument",
+    "normal_centre", "normal_tail", "sine_cosine", "smaller", "unit",
 ]  # fmt: skip
 
 TAIL = 5.0
@@ -32,6 +34,29 @@ def bits(_context, _x):  # type: ignore[no-untyped-def]
 def from_bits(_context, _x):  # type: ignore[no-untyped-def]
     """Float32 with the bits of an int32."""
     return types.float32(types.int32), lambda _c, builder, _s, a: builder.bitcast(a[0], ir.FloatType())
+
+
+@intrinsic
+def floor(_context, _x):  # type: ignore[no-untyped-def]
+    """Largest whole number not above a float32, itself a float32."""
+
+    def code(_context, builder, _signature, arguments):  # type: ignore[no-untyped-def]
+        function = builder.module.declare_intrinsic("llvm.floor", [ir.FloatType()])
+        return builder.call(function, arguments)
+
+    return types.float32(types.float32), code
+
+
+@njit(inline="always")
+def larger(a, b):  # type: ignore[no-untyped-def]
+    """The larger of two numbers (the built-in function is not compiled for every GPU target)."""
+    return b if b > a else a
+
+
+@njit(inline="always")
+def smaller(a, b):  # type: ignore[no-untyped-def]
+    """The smaller of two numbers."""
+    return b if b < a else a
 
 
 def _polynomial(*coefficients: float):  # type: ignore[no-untyped-def]
@@ -88,7 +113,7 @@ _erfinv_tail = _polynomial(
 def log2(x):  # type: ignore[no-untyped-def]
     """Binary logarithm of a positive normal float32; absolute error below 1e-6 for x in (2^-24, 2)."""
     word = bits(x)
-    exponent = (word - int32(0x3F3504F3)) >> int32(23)
+    exponent = int32((word - int32(0x3F3504F3)) >> int32(23))
     z = from_bits(int32(word - (exponent << int32(23)))) - float32(1)
     return float32(exponent) + z * _log2_over_z(z)
 
@@ -96,8 +121,8 @@ def log2(x):  # type: ignore[no-untyped-def]
 @njit(inline="always", fastmath=_CONTRACT)
 def exp2(x):  # type: ignore[no-untyped-def]
     """Two to the power of a float32 up to 127, at least 2^-126; relative error below 2e-7 where x is exact."""
-    x = max(x, float32(-126.0))
-    whole = np.floor(x + float32(0.5))
+    x = larger(x, float32(-126.0))
+    whole = floor(x + float32(0.5))
     return _exp2_near_0(x - whole) * from_bits(int32((int32(whole) + int32(127)) << int32(23)))
 
 
@@ -123,7 +148,7 @@ def normal_centre(x, w):  # type: ignore[no-untyped-def]
 @njit(inline="always", fastmath=_CONTRACT)
 def normal_tail(x, w):  # type: ignore[no-untyped-def]
     """The same for w from `TAIL` on."""
-    return float32(1.4142135623730951) * x * _erfinv_tail(np.sqrt(w) - float32(3))
+    return float32(1.4142135623730951) * x * _erfinv_tail(math.sqrt(w) - float32(3))
 
 
 @njit(inline="always", fastmath=_CONTRACT)
@@ -139,10 +164,10 @@ def normal(x):  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def unit(word):  # type: ignore[no-untyped-def]
     """Float32 in (0, 1), never either end, from the upper 23 bits of a 32-bit word."""
-    return (float32(word >> uint32(9)) + float32(0.5)) * float32(2.0**-23)
+    return (float32(int32(word >> uint32(9))) + float32(0.5)) * float32(2.0**-23)
 
 
 @njit(inline="always")
 def centred(word):  # type: ignore[no-untyped-def]
     """Float32 in (-1, 1), never either end nor 0, from the upper 24 bits of a 32-bit word."""
-    return (float32(int32(word) >> int32(8)) + float32(0.5)) * float32(2.0**-23)
+    return (float32(int32(int32(word) >> int32(8))) + float32(0.5)) * float32(2.0**-23)

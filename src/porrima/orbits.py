@@ -26,7 +26,7 @@ def projection_factor(isotropic, u, v):  # type: ignore[no-untyped-def]
     """
     half = float32(0.5)
     product = u if isotropic else sine_cosine(half * u)[0] * sine_cosine(half * v)[0]
-    return np.sqrt((float32(1) - product) * (float32(1) + product))
+    return math.sqrt((float32(1) - product) * (float32(1) + product))
 
 
 def projection_nodes(projection: Projection) -> tuple[FloatArray, FloatArray]:

@@ -11,13 +11,13 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import float32, int32, njit, uint32, uint64
+from numba import float32, int32, int64, njit, uint32, uint64
 from scipy.special import ndtr
 
-from porrima.elementary import centred, exp2, log2, sine_cosine, unit
+from porrima.elementary import bits, centred, exp2, larger, log2, sine_cosine, smaller, unit
 from porrima.orbits import projection_factor
 from porrima.photometry import STEP, magnitudes
-from porrima.streams import philox
+from porrima.streams import PAIR_STAGE, PHASE_STAGE, SINGLE_STAGE, philox, uniform_pair
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,8 +27,9 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 __all__ = [
-    "CUT", "Tables", "add_moments", "axis_argument", "companion_mass", "direction", "flux_ratio", "is_too_many",
-    "phase_word", "place_on_track", "primary", "random_words", "separation", "tables_of",
+    "CUT", "MOST_TRIES", "Tables", "add_moments", "axis_argument", "companion_mass", "direction", "flux_ratio",
+    "is_too_many", "phase_word", "place_on_track", "primary", "random_words", "separation", "single_star",
+    "tables_of",
 ]  # fmt: skip
 
 WIDTH = 8
@@ -47,7 +48,8 @@ takes a hundred times as long for a product."""
 _SMALLEST = -6.0
 """Binary logarithm of the least semi-major axis, 4e-6 of the cut."""
 
-_PAIR, _PHASE_STAGE = 2, 4  # stages of a stack, as in `stack`
+MOST_TRIES = 10_000
+"""Pairs drawn for each star of a stack before it is given up: all are resolved."""
 
 
 class Tables(NamedTuple):
@@ -169,13 +171,13 @@ _step = njit(inline="always", fastmath={"contract"}, error_model="numpy")
 @_step
 def random_words(key_low, key_high, stack_low, stack_high, pair):  # type: ignore[no-untyped-def]
     """Four 32-bit words of one pair: one call of the generator is all that it needs."""
-    return philox(key_low, key_high, pair, _PAIR, stack_low, stack_high)
+    return philox(key_low, key_high, pair, PAIR_STAGE, stack_low, stack_high)
 
 
 @_step
 def phase_word(key_low, key_high, stack_low, stack_high, pair):  # type: ignore[no-untyped-def]
     """A fifth word, for orbits whose projection takes two random numbers."""
-    return philox(key_low, key_high, pair, _PHASE_STAGE, stack_low, stack_high)[0]
+    return philox(key_low, key_high, pair, PHASE_STAGE, stack_low, stack_high)[0]
 
 
 @_step
@@ -200,17 +202,31 @@ def is_too_many(mass_word, axis_word, scale, fraction):  # type: ignore[no-untyp
     return _unit16(spare) * (float32(scale) * fraction) >= float32(1)
 
 
+@njit(inline="always")
+def single_star(tables, scale, key_low, key_high, stack_low, stack_high, draw):  # type: ignore[no-untyped-def]
+    """Number of a single star and the next free draw: any star, kept with its probability of being single."""
+    single = -1
+    while single < 0:
+        words = philox(key_low, key_high, draw, SINGLE_STAGE, stack_low, stack_high)
+        draw += 1
+        star = int64((uint64(words[0]) * uint64(tables.stay.size)) >> uint64(32))
+        law = bits(tables.star[star, LAW])
+        if uniform_pair(words[1], words[2]) >= scale * tables.law[law, FRACTION]:
+            single = star
+    return single, draw
+
+
 @_step
 def axis_argument(axis_word, truncation):  # type: ignore[no-untyped-def]
     """Uniform number in (-1, 1) from which the semi-major axis follows, below its truncation."""
-    return max((centred(axis_word) + float32(1)) * truncation - float32(1), float32(-0.9999999))
+    return larger((centred(axis_word) + float32(1)) * truncation - float32(1), float32(-0.9999999))
 
 
 @_step
 def separation(isotropic, log_a, turn_word, phase_word):  # type: ignore[no-untyped-def]
     """Projected separation of an orbit with log2 of its semi-major axis."""
     rho = projection_factor(isotropic, _unit16(turn_word >> uint32(16)), unit(phase_word))
-    return exp2(min(max(log_a, float32(_SMALLEST)), float32(60.0))) * rho
+    return exp2(smaller(larger(log_a, float32(_SMALLEST)), float32(60.0))) * rho
 
 
 @_step
@@ -234,8 +250,8 @@ def companion_mass(word, mass, slope, start, flat):  # type: ignore[no-untyped-d
 @_step
 def place_on_track(mass, start, per_unit, n_grid):  # type: ignore[no-untyped-def]
     """Interval of the grid that holds a mass, and the place in it; beyond the end, the last one goes on."""
-    place = max((mass - start) * per_unit, float32(0))
-    k = min(int32(place), int32(n_grid - 1))
+    place = larger((mass - start) * per_unit, float32(0))
+    k = smaller(int32(place), int32(n_grid - 1))
     return k, place - float32(k)
 
 
@@ -245,14 +261,14 @@ def flux_ratio(w1, w2, w3, t, l0, l1, l2, l3, r0, r1, r2, r3, primary_flux, is_d
     w0 = float32(1) - (w1 + w2 + w3)
     left = w0 * l0 + w1 * l1 + w2 * l2 + w3 * l3
     right = w0 * r0 + w1 * r1 + w2 * r2 + w3 * r3
-    ratio = min(exp2(left + t * (right - left) - primary_flux), float32(1))
+    ratio = smaller(exp2(left + t * (right - left) - primary_flux), float32(1))
     return float32(0) if is_dark else ratio
 
 
 @_step
-def _unit16(bits):  # type: ignore[no-untyped-def]
+def _unit16(word):  # type: ignore[no-untyped-def]
     """Float32 in (0, 1), never either end, from 16 bits."""
-    return (float32(int32(bits)) + float32(0.5)) * float32(2.0**-16)
+    return (float32(int32(word)) + float32(0.5)) * float32(2.0**-16)
 
 
 @_step

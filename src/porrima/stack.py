@@ -28,31 +28,29 @@ from porrima.blocks import (
     sum_block,
     weigh_block,
 )
-from porrima.elementary import bits
 from porrima.moments import INDICES, N_MOMENTS, KernelMoments
-from porrima.pairs import CUT, FRACTION, LAW, tables_of
-from porrima.streams import binomial, philox, uniform_pair
+from porrima.pairs import CUT, MOST_TRIES, single_star, tables_of
+from porrima.streams import COUNT_STAGE, FRACTION_STAGE, binomial, halves, philox, uniform_pair
 from porrima.systems import Systems
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from porrima.systems import Population
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["BinaryFraction", "Stacks", "draw_stacks", "draw_systems"]
+__all__ = ["BinaryFraction", "Device", "Stacks", "draw_stacks", "draw_systems"]
+
+Device = Literal["cpu", "cuda"]
+"""Where stacks are drawn."""
 
 BinaryFraction = float | Literal["uniform", "model"]
 """A number in [0, 1], ``uniform`` for one in (0, 1) per stack, ``model`` for the multiplicity model's own."""
 
-_FRACTION, _COUNT, _SINGLE = (
-    0,
-    1,
-    3,
-)  # stages of a stack, each with a stream of its own; 2 and 4 are in `pairs`
 _MAX_SEED = 2**64
-_MOST_TRIES = 10_000  # pairs drawn for each star of a stack before it is given up: all are resolved
 _BATCH = 64  # stacks that share one thread's room
 _BLOCKS_IN_FLOAT32 = 32  # sums of more blocks than these go on in float64
 
@@ -81,6 +79,7 @@ def draw_stacks(
     seed: int,
     first: int,
     last: int,
+    device: Device = "cpu",
 ) -> Stacks:
     """Kernel moments of the stacks number `first` to `last` - 1 of a run.
 
@@ -96,6 +95,8 @@ def draw_stacks(
         Of the run, from 0 to 2^64 - 1.
     first, last : int
         Range of stack numbers; the numbers of a stack do not depend on it.
+    device : {"cpu", "cuda"}
+        Where to draw; a GPU draws the same pairs, and its moments differ in rounding alone.
 
     Returns
     -------
@@ -105,13 +106,14 @@ def draw_stacks(
     Raises
     ------
     ValueError
-        If a count, the seed or the binary fraction is out of range.
+        If a count, the seed or the binary fraction is out of range, or the device is unknown or not there.
     """
     fractions = _fractions(population, n_stars, binary_fraction, seed, first, last)
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(last - first)
     sums = np.zeros((last - first, N_MOMENTS))
     unit = np.array([(population.cut / CUT) ** (a + b) for a, b in INDICES])
-    _fill(tables_of(population), np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
+    fill = _filler(device)
+    fill(tables_of(population), np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
     if np.any(np.isnan(sums[:, 0])):
         raise ValueError(
             f"cut must leave some pairs unresolved at this binary fraction, got {population.cut}"
@@ -155,6 +157,17 @@ def draw_systems(
     return Systems.from_pairs(flux_ratio, dx * unit, dy * unit, weight)
 
 
+def _filler(device: Device) -> Callable[..., None]:
+    """The function that draws the stacks of a range on a device; numba.cuda is loaded only where it is needed."""
+    if device not in ("cpu", "cuda"):
+        raise ValueError(f"device must be cpu or cuda, got {device}")
+    if device == "cpu":
+        return _fill  # type: ignore[no-any-return]
+    from porrima.gpu import fill
+
+    return fill
+
+
 def _fractions(
     population: Population, n_stars: int, binary_fraction: BinaryFraction, seed: int, first: int, last: int
 ) -> FloatArray:
@@ -176,18 +189,12 @@ def _fractions(
     return np.full(last - first, float(binary_fraction))
 
 
-@njit(inline="always")
-def _halves(number):  # type: ignore[no-untyped-def]
-    """Low and high 32 bits of a number."""
-    return np.uint32(np.uint64(number) & np.uint64(0xFFFFFFFF)), np.uint32(np.uint64(number) >> np.uint64(32))
-
-
 @njit(cache=True)
 def _uniform_fractions(seed, first, fractions):  # type: ignore[no-untyped-def]
-    key_low, key_high = _halves(seed)
+    key_low, key_high = halves(seed)
     for s in range(fractions.size):
-        low, high = _halves(first + s)
-        words = philox(key_low, key_high, 0, _FRACTION, low, high)
+        low, high = halves(first + s)
+        words = philox(key_low, key_high, 0, FRACTION_STAGE, low, high)
         fractions[s] = uniform_pair(words[0], words[1])
 
 
@@ -200,9 +207,9 @@ def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, list
     The pairs of a stack are one stream.  As many are taken as the binomial draw says; for each that is resolved
     another star is drawn, which is a pair with the same probability, until none is.
     """
-    key_low, key_high = _halves(seed)
-    low, high = _halves(stack)
-    wanted, draw = binomial(n_stars, fraction, key_low, key_high, _COUNT, low, high, 0)
+    key_low, key_high = halves(seed)
+    low, high = halves(stack)
+    wanted, draw = binomial(n_stars, fraction, key_low, key_high, COUNT_STAGE, low, high, 0)
     n_blocks, resolved, kept, total, lane = 0, 0, 0, 0.0, LANES
     while wanted > 0:
         if lane == LANES:
@@ -210,7 +217,7 @@ def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, list
                 total += _add_block(tables.weight, block, listed)
                 if n_blocks % _BLOCKS_IN_FLOAT32 == 0:
                     flush(block, sums)
-            if n_blocks * LANES > _MOST_TRIES * (n_stars + 100):
+            if n_blocks * LANES > MOST_TRIES * (n_stars + 100):
                 return np.nan
             draw_block(tables, block, scale, key_low, key_high, low, high, n_blocks * LANES)
             n_blocks, lane = n_blocks + 1, 0
@@ -221,7 +228,7 @@ def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, list
             lane, n_valid, n_kept = keep_lanes(block, lane, wanted)
         wanted, resolved, kept = wanted - n_valid, resolved + n_valid - n_kept, kept + n_kept
         if wanted == 0 and resolved > 0:
-            wanted, draw = binomial(resolved, fraction, key_low, key_high, _COUNT, low, high, draw)
+            wanted, draw = binomial(resolved, fraction, key_low, key_high, COUNT_STAGE, low, high, draw)
             resolved = 0
     if n_blocks > 0:
         total += _add_block(tables.weight, block, listed)
@@ -254,14 +261,9 @@ def _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, lis
     total, draw = 0.0, 0
     for single in range(kept, n_stars):
         weight = 1.0
-        while tables.weight.size > 0:  # any star, kept with its probability of being single
-            words = philox(key_low, key_high, draw, _SINGLE, low, high)
-            draw += 1
-            star = int((np.uint64(words[0]) * np.uint64(tables.stay.size)) >> np.uint64(32))
-            law = bits(tables.star[star, LAW])
-            if uniform_pair(words[1], words[2]) >= scale * tables.law[law, FRACTION]:
-                weight = float(tables.weight[star])
-                break
+        if tables.weight.size > 0:
+            star, draw = single_star(tables, scale, key_low, key_high, low, high, draw)
+            weight = float(tables.weight[star])
         total += weight
         if listed.shape[0] > 0:
             listed[single, 0], listed[single, 3] = 0.0, weight

@@ -11,10 +11,21 @@ import math
 
 from numba import int32, njit, uint32, uint64
 
-__all__ = ["binomial", "philox", "uniform_pair"]
+__all__ = [
+    "COUNT_STAGE", "FRACTION_STAGE", "PAIR_STAGE", "PHASE_STAGE", "SINGLE_STAGE", "binomial", "halves", "philox",
+    "uniform_pair",
+]  # fmt: skip
 
+FRACTION_STAGE, COUNT_STAGE, PAIR_STAGE, SINGLE_STAGE, PHASE_STAGE = range(5)
+"""Stages of a stack, each with a stream of its own."""
 
 _LOW = uint64(0xFFFFFFFF)
+
+
+@njit(inline="always")
+def halves(number):  # type: ignore[no-untyped-def]
+    """Low and high 32 bits of a number."""
+    return uint32(uint64(number) & _LOW), uint32(uint64(number) >> uint64(32))
 
 
 @njit(inline="always")
