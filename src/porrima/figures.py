@@ -387,3 +387,77 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
             handles, labels, loc="outside upper center", frameon=False, fontsize=8.5, ncols=len(estimators)
         )
     return figure
+
+
+_SPEEDS = (
+    ("moments", "engine, moments", _COLOURS[0], "o"),
+    ("shapes", "engine, with shapes", _COLOURS[5], "D"),
+    ("floor", "random numbers alone", "0.45", "|"),
+    ("fft", "numpy, histogram and FFT", _COLOURS[2], "^"),
+    ("galsim-sum", "GalSim, one draw per stack", _COLOURS[4], "s"),
+    ("galsim-stars", "GalSim, star by star", _COLOURS[1], "v"),
+)
+_COSTS = (("us_per_stack", 0), ("us_per_stack_with_shape", 1))  # against the first two of _SPEEDS
+
+
+def performance(result: dict[str, Any]) -> Figure:
+    """Speed of the engine and its peers, and the engine's cost against stars in a stack and number of stacks.
+
+    Parameters
+    ----------
+    result : dict
+        From `bench.bench`: stars per s, µs per stack (dimensionless where a ratio).
+
+    Returns
+    -------
+    figure : Figure
+        Three panels, all on logarithmic axes.
+    """
+    with rc_context(_STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(10.4, 3.9), layout="constrained")
+        axes = figure.subplots(1, 3, width_ratios=(1.35, 1.0, 1.0))
+        _speeds(axes[0], result["speeds"])
+        for axis, rows, key, per_star in (
+            (axes[1], result["cost_of_stars"], "n_stars", True),
+            (axes[2], result["cost_of_stacks"], "n_stacks", False),
+        ):
+            for name, number in _COSTS:
+                _, label, colour, marker = _SPEEDS[number]
+                unit = [1e3 / row["n_stars"] if per_star else 1.0 for row in rows]
+                cost = [factor * row[name] for factor, row in zip(unit, rows, strict=True)]
+                error = [factor * row[f"{name}_error"] for factor, row in zip(unit, rows, strict=True)]
+                places = [row[key] for row in rows]
+                axis.errorbar(places, cost, yerr=error, color=colour, marker=marker, markersize=4.0, linewidth=1.0,
+                              label=label)  # fmt: skip
+                axis.axhline(cost[-1], color=colour, linestyle=":", linewidth=0.9)
+            axis.set(xscale="log", yscale="log")
+            axis.legend(frameon=False, fontsize=8.0, loc="upper right")
+        axes[1].set(xlabel=r"stars in a stack, $N_\star$", ylabel="cost [ns per star]")
+        axes[2].set(xlabel=r"stacks of 40 stars, $N_s$", ylabel="cost [µs per stack]")
+        figure.suptitle(f"{result['processor']}, {result['threads']} threads", fontsize=9)
+    return figure
+
+
+def _speeds(axis: Any, rows: list[dict[str, Any]]) -> None:
+    """One line for each PSF and size of stack, one symbol for each way to the same shapes."""
+    kinds = list(dict.fromkeys((row["psf"], row["n_stars"]) for row in rows))
+    for who, label, colour, marker in _SPEEDS:
+        for device in dict.fromkeys(row["device"] for row in rows if row["who"] == who):
+            here = [row for row in rows if row["who"] == who and row["device"] == device]
+            axis.errorbar(
+                [row["stars_per_s"] for row in here],
+                [kinds.index((row["psf"], row["n_stars"])) for row in here],
+                xerr=[row["stars_per_s_error"] for row in here],
+                color=colour, marker=marker, markersize=12.0 if marker == "|" else 6.0, linestyle="none",
+                fillstyle="full" if device == "cpu" else "none",
+                label=label if device == "cpu" else f"{label} ({device})",
+            )  # fmt: skip
+    axis.set_xscale("log")
+    labels = [f"{psf}\n$N_\\star = {n_stars}$" for psf, n_stars in kinds]
+    axis.set_yticks(range(len(kinds)), labels)
+    axis.set_ylim(len(kinds) - 0.5, -0.5)
+    axis.tick_params(axis="y", which="both", length=0)
+    axis.grid(axis="x", color="0.92", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.set_xlabel("stars per second")
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, frameon=False, fontsize=8.0)
