@@ -414,26 +414,29 @@ def performance(result: dict[str, Any]) -> Figure:
         Three panels, all on logarithmic axes.
     """
     with rc_context(_STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(10.4, 3.9), layout="constrained")
-        axes = figure.subplots(1, 3, width_ratios=(1.35, 1.0, 1.0))
+        figure = Figure(figsize=(9.6, 3.9), layout="constrained")
+        axes = figure.subplots(1, 3, width_ratios=(1.4, 1.0, 1.0))
         _speeds(axes[0], result["speeds"])
         for axis, rows, key, per_star in (
             (axes[1], result["cost_of_stars"], "n_stars", True),
             (axes[2], result["cost_of_stacks"], "n_stacks", False),
         ):
+            unit = np.array([1e3 / row["n_stars"] if per_star else 1.0 for row in rows])
             for name, number in _COSTS:
-                _, label, colour, marker = _SPEEDS[number]
-                unit = [1e3 / row["n_stars"] if per_star else 1.0 for row in rows]
-                cost = [factor * row[name] for factor, row in zip(unit, rows, strict=True)]
-                error = [factor * row[f"{name}_error"] for factor, row in zip(unit, rows, strict=True)]
-                places = [row[key] for row in rows]
-                axis.errorbar(places, cost, yerr=error, color=colour, marker=marker, markersize=4.0, linewidth=1.0,
-                              label=label)  # fmt: skip
-                axis.axhline(cost[-1], color=colour, linestyle=":", linewidth=0.9)
+                cost = unit * [row[name] for row in rows]
+                error = unit * [row[f"{name}_error"] for row in rows]
+                _, _, colour, marker = _SPEEDS[number]
+                axis.errorbar(
+                    [row[key] for row in rows], cost, yerr=error,
+                    color=colour, marker=marker, markersize=4.0, linewidth=1.0,
+                )  # fmt: skip
             axis.set(xscale="log", yscale="log")
-            axis.legend(frameon=False, fontsize=8.0, loc="upper right")
-        axes[1].set(xlabel=r"stars in a stack, $N_\star$", ylabel="cost [ns per star]")
-        axes[2].set(xlabel=r"stacks of 40 stars, $N_s$", ylabel="cost [µs per stack]")
+            axis.grid(color="0.92", linewidth=0.6)
+            axis.set_axisbelow(True)
+        axes[1].set(xlabel="stars in a stack", ylabel="engine: cost [ns per star]")
+        axes[2].set(xlabel="stacks of 40 stars", ylabel="engine: cost [µs per stack]")
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=8.5)
         figure.suptitle(f"{result['processor']}, {result['threads']} threads", fontsize=9)
     return figure
 
@@ -453,11 +456,12 @@ def _speeds(axis: Any, rows: list[dict[str, Any]]) -> None:
                 label=label if device == "cpu" else f"{label} ({device})",
             )  # fmt: skip
     axis.set_xscale("log")
-    labels = [f"{psf}\n$N_\\star = {n_stars}$" for psf, n_stars in kinds]
-    axis.set_yticks(range(len(kinds)), labels)
+    axis.xaxis.set_major_locator(LogLocator(numticks=12))
+    axis.set_yticks(
+        range(len(kinds)), [f"{psf}\n{n_stars:,} stars".replace(",", " ") for psf, n_stars in kinds]
+    )
     axis.set_ylim(len(kinds) - 0.5, -0.5)
     axis.tick_params(axis="y", which="both", length=0)
     axis.grid(axis="x", color="0.92", linewidth=0.6)
     axis.set_axisbelow(True)
     axis.set_xlabel("stars per second")
-    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, frameon=False, fontsize=8.0)
