@@ -27,7 +27,7 @@ NAMES = {
     "galsim-sum": "GalSim, one draw per stack",
     "fft": "numpy, histogram and FFT",
     "response": "response",
-    "stamps": "`measure_stamps`",
+    "stamps": "Porrima, on pixels",
     "hsm": "HSM",
 }
 """Of what is measured, in words."""
