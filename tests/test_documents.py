@@ -16,6 +16,7 @@ from porrima.catalogs import READERS
 from porrima.cli import app, main
 from porrima.config import Multiplicity, Photometry, RunConfig, StarsConfig, parse
 from porrima.multiplicity import MULTIPLICITY
+from porrima.performance import BEGIN, END, with_tables
 from porrima.photometry import PHOTOMETRY, MainSequence
 from porrima.psf import PSFS
 from porrima.shapes import ESTIMATORS
@@ -23,6 +24,7 @@ from porrima.shapes import ESTIMATORS
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 README, COMMANDS, MODELS = ROOT / "README.md", ROOT / "docs" / "commands.md", ROOT / "docs" / "models.md"
+BENCH = ROOT / "docs" / "bench.json"
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 KEY = re.compile(r"\b[A-Z][A-Za-z]*\d{2,4}[a-z]?\b")  # KCM16, Robin2003
 GROUP = typer.main.get_command(app)
@@ -130,6 +132,17 @@ def test_every_json_key_is_documented(monkeypatch, capsys, tmp_path):
         keys = keys_of(json_of(monkeypatch, capsys, command, *arguments))
         missing = {key for key in keys if f"`{key}`" not in section(command)}
         assert not missing, (command, missing)
+
+
+def test_every_key_of_a_benchmark_is_documented():
+    missing = {key for key in keys_of(json.loads(BENCH.read_text())) if f"`{key}`" not in section("bench")}
+    assert not missing
+
+
+def test_the_tables_of_the_performance_page_are_those_of_its_benchmark():
+    page = (ROOT / "docs" / "performance.md").read_text(encoding="utf-8")
+    assert page.count(BEGIN) == page.count(END) == 1
+    assert page == with_tables(page, json.loads(BENCH.read_text(encoding="utf-8")))
 
 
 def test_every_key_of_the_configuration_is_documented():

@@ -301,18 +301,27 @@ def paper(
 
 @app.command()
 def bench(
-    n_stars: Annotated[int, typer.Option(help="In each stack.", min=1)] = 40,
-    n_stacks: Annotated[int, typer.Option(help="Of the engine.", min=1)] = 100_000,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder: numbers, figure, tables.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Half a minute instead of three.")] = False,
     seed: Seed = 1,
     as_json: Json = False,
 ) -> None:
-    """Stars per second, and the ratio to drawing each star with GalSim in the same run."""
-    from dataclasses import asdict
+    """How fast the engine is, beside GalSim, numpy and its own random numbers, all in one run."""
+    from porrima.bench import FULL, QUICK, n_steps
+    from porrima.bench import bench as measured
+    from porrima.files import make_folder
+    from porrima.performance import lines, write_performance
 
-    from porrima.bench import measure_speed
-
-    result = asdict(measure_speed(n_stars=n_stars, n_stacks=n_stacks, seed=seed))
-    show(result, as_json, "speed", ["quantity", "value"], [[k, v] for k, v in result.items()])
+    if output is not None:
+        make_folder(output)
+    sizes = QUICK if quick else FULL
+    with Progress(n_steps(sizes), "steps") as progress:
+        result = measured(sizes, seed=seed, progress=progress.advance)
+    if output is not None:
+        write_performance(result, output)
+    show(result, as_json, f"speed, {result['versions']}", ["quantity", "value", "unit"], lines(result))
 
 
 @app.command()

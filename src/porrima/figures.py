@@ -387,3 +387,81 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
             handles, labels, loc="outside upper center", frameon=False, fontsize=8.5, ncols=len(estimators)
         )
     return figure
+
+
+_SPEEDS = (
+    ("moments", "engine, moments", _COLOURS[0], "o"),
+    ("shapes", "engine, with shapes", _COLOURS[5], "D"),
+    ("floor", "random numbers alone", "0.45", "|"),
+    ("fft", "numpy, histogram and FFT", _COLOURS[2], "^"),
+    ("galsim-sum", "GalSim, one draw per stack", _COLOURS[4], "s"),
+    ("galsim-stars", "GalSim, star by star", _COLOURS[1], "v"),
+)
+_COSTS = (("us_per_stack", 0), ("us_per_stack_with_shape", 1))  # against the first two of _SPEEDS
+
+
+def performance(result: dict[str, Any]) -> Figure:
+    """Speed of the engine and its peers, and the engine's cost against stars in a stack and number of stacks.
+
+    Parameters
+    ----------
+    result : dict
+        From `bench.bench`: stars per s, µs per stack (dimensionless where a ratio).
+
+    Returns
+    -------
+    figure : Figure
+        Three panels, all on logarithmic axes.
+    """
+    with rc_context(_STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(9.6, 3.9), layout="constrained")
+        axes = figure.subplots(1, 3, width_ratios=(1.4, 1.0, 1.0))
+        _speeds(axes[0], result["speeds"])
+        for axis, rows, key, per_star in (
+            (axes[1], result["cost_of_stars"], "n_stars", True),
+            (axes[2], result["cost_of_stacks"], "n_stacks", False),
+        ):
+            unit = np.array([1e3 / row["n_stars"] if per_star else 1.0 for row in rows])
+            for name, number in _COSTS:
+                cost = unit * [row[name] for row in rows]
+                error = unit * [row[f"{name}_error"] for row in rows]
+                _, _, colour, marker = _SPEEDS[number]
+                axis.errorbar(
+                    [row[key] for row in rows], cost, yerr=error,
+                    color=colour, marker=marker, markersize=4.0, linewidth=1.0,
+                )  # fmt: skip
+            axis.set(xscale="log", yscale="log")
+            axis.grid(color="0.92", linewidth=0.6)
+            axis.set_axisbelow(True)
+        axes[1].set(xlabel="stars in a stack", ylabel="engine: cost [ns per star]")
+        axes[2].set(xlabel="stacks of 40 stars", ylabel="engine: cost [µs per stack]")
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=8.5)
+        figure.suptitle(f"{result['processor']}, {result['threads']} threads", fontsize=9)
+    return figure
+
+
+def _speeds(axis: Any, rows: list[dict[str, Any]]) -> None:
+    """One line for each PSF and size of stack, one symbol for each way to the same shapes."""
+    kinds = list(dict.fromkeys((row["psf"], row["n_stars"]) for row in rows))
+    for who, label, colour, marker in _SPEEDS:
+        for device in dict.fromkeys(row["device"] for row in rows if row["who"] == who):
+            here = [row for row in rows if row["who"] == who and row["device"] == device]
+            axis.errorbar(
+                [row["stars_per_s"] for row in here],
+                [kinds.index((row["psf"], row["n_stars"])) for row in here],
+                xerr=[row["stars_per_s_error"] for row in here],
+                color=colour, marker=marker, markersize=12.0 if marker == "|" else 6.0, linestyle="none",
+                fillstyle="full" if device == "cpu" else "none",
+                label=label if device == "cpu" else f"{label} ({device})",
+            )  # fmt: skip
+    axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(numticks=12))
+    axis.set_yticks(
+        range(len(kinds)), [f"{psf}\n{n_stars:,} stars".replace(",", " ") for psf, n_stars in kinds]
+    )
+    axis.set_ylim(len(kinds) - 0.5, -0.5)
+    axis.tick_params(axis="y", which="both", length=0)
+    axis.grid(axis="x", color="0.92", linewidth=0.6)
+    axis.set_axisbelow(True)
+    axis.set_xlabel("stars per second")

@@ -75,6 +75,8 @@ def _draw(tables, seed, first, n_stars, fraction, n_pairs):  # type: ignore[no-u
                     drawn += LANES
                 wanted = 0
                 if resolved > 0:
-                    wanted, draw = binomial(resolved, fraction, key_low, key_high, COUNT_STAGE, low, high, draw)
+                    wanted, draw = binomial(
+                        resolved, fraction, key_low, key_high, COUNT_STAGE, low, high, draw
+                    )
                 needed += wanted
             n_pairs[s] = drawn
