@@ -172,9 +172,9 @@ def _draw_words(isotropic, block, key_low, key_high, stack_low, stack_high, firs
 
 
 @_loop
-def _primaries(stay, alias, block):  # type: ignore[no-untyped-def]
+def _primaries(alias, block):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
-        block[_NUMBER + lane] = from_bits(int32(primary(uint32(bits(block[_WORD + lane])), stay, alias)))
+        block[_NUMBER + lane] = from_bits(int32(primary(uint32(bits(block[_WORD + lane])), alias)))
 
 
 @_loop
@@ -259,7 +259,7 @@ def _validity(scale, is_capped, block):  # type: ignore[no-untyped-def]
 def draw_numbers(tables, block, key_low, key_high, stack_low, stack_high, first):  # type: ignore[no-untyped-def]
     """The random part of `draw_block` alone, with whatever stars and laws the block holds: the least it can cost."""
     _draw_words(tables.isotropic, block, key_low, key_high, stack_low, stack_high, first)
-    _primaries(tables.stay, tables.alias, block)
+    _primaries(tables.alias, block)
     _axes(block)
     _separations(tables.isotropic, block)
     _companion_masses(block)
@@ -269,7 +269,7 @@ def draw_numbers(tables, block, key_low, key_high, stack_low, stack_high, first)
 def draw_block(tables, block, scale, key_low, key_high, stack_low, stack_high, first):  # type: ignore[no-untyped-def]
     """Draw the pairs of one block, none of them kept yet; `first` is the number of the first in its stack."""
     _draw_words(tables.isotropic, block, key_low, key_high, stack_low, stack_high, first)
-    _primaries(tables.stay, tables.alias, block)
+    _primaries(tables.alias, block)
     _take_rows(tables.star, block, _NUMBER, _STAR)
     _laws(block)
     _take_rows(tables.law, block, _ROW_NUMBER, _LAW)

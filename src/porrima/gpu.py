@@ -203,7 +203,7 @@ def _weigh_singles(tables, scale, key_low, key_high, low, high, n_stars, kept): 
 def _draw_pair(tables, scale, key_low, key_high, low, high, pair):  # type: ignore[no-untyped-def]
     """Number of the star, flux ratio and offset of one pair; whether its star may have one, and whether it is kept."""
     words = random_words(key_low, key_high, low, high, pair)
-    star = primary(words[0], tables.stay, tables.alias)
+    star = primary(words[0], tables.alias)
     law = bits(tables.star[star, LAW])
     deviate = normal(axis_argument(words[2], tables.law[law, TRUNCATION]))
     phase = uint32(0) if tables.isotropic else phase_word(key_low, key_high, low, high, pair)

@@ -14,7 +14,7 @@ import numpy as np
 from numba import float32, int32, int64, njit, uint32, uint64
 from scipy.special import ndtr
 
-from porrima.elementary import bits, centred, exp2, larger, log2, sine_cosine, smaller, unit
+from porrima.elementary import bits, centred, exp2, from_bits, larger, log2, sine_cosine, smaller, unit
 from porrima.orbits import projection_factor
 from porrima.photometry import STEP, magnitudes
 from porrima.streams import PAIR_STAGE, PHASE_STAGE, SINGLE_STAGE, philox, uniform_pair
@@ -72,8 +72,7 @@ class Tables(NamedTuple):
     isotropic: bool
     largest_fraction: float
     weight: NDArray[np.float32]  # (n,) of each star in a stack; no rows where all count alike
-    stay: NDArray[np.float32]  # (n,) alias table of the multiplicity fractions: probability to stay,
-    alias: NDArray[np.int32]  # (n,) and the star taken otherwise
+    alias: NDArray[np.float32]  # (n, 2) alias table of the multiplicity fractions: see `alias_table`
 
 
 @lru_cache(maxsize=2)
@@ -122,7 +121,6 @@ def tables_of(population: Population) -> Tables:
     numbers = [
         number.astype(np.int32).view(np.float32) for number in (group_number.ravel(), law_number.ravel())
     ]
-    stay, alias = alias_table(law.multiplicity_fraction)
     equal = bool(np.all(population.weight == 1.0))
     return Tables(
         star=np.stack([*(column.astype(np.float32) for column in columns), *numbers], axis=1),
@@ -135,14 +133,15 @@ def tables_of(population: Population) -> Tables:
         isotropic=population.projection == "isotropic",
         largest_fraction=float(law.multiplicity_fraction.max()),
         weight=np.empty(0, np.float32) if equal else population.weight.astype(np.float32),
-        stay=stay,
-        alias=alias,
+        alias=alias_table(law.multiplicity_fraction),
     )
 
 
 @njit(cache=True)
 def alias_table(weight):  # type: ignore[no-untyped-def]
-    """Probability to stay and the alias of each of n stars: a uniform draw then follows their weights (Vose 1991)."""
+    """Alias table (n, 2) by which a uniform draw follows the weights of n stars (Vose 1991): the probability to stay
+    with a star, and the number (as bits) of the star taken otherwise.
+    """
     n = weight.size
     stay, alias = weight * (n / weight.sum()), np.arange(n).astype(np.int32)
     small, large = np.empty(n, np.int64), np.empty(n, np.int64)
@@ -162,7 +161,10 @@ def alias_table(weight):  # type: ignore[no-untyped-def]
             small[n_small], n_small = high, n_small + 1
     for k in range(n_small):  # full but for rounding
         stay[small[k]] = 1.0
-    return np.minimum(stay, 1.0).astype(np.float32), alias
+    table = np.empty((n, 2), np.float32)
+    for k in range(n):
+        table[k, 0], table[k, 1] = min(stay[k], 1.0), from_bits(alias[k])
+    return table
 
 
 _step = njit(inline="always", fastmath={"contract"}, error_model="numpy")
@@ -181,15 +183,15 @@ def phase_word(key_low, key_high, stack_low, stack_high, pair):  # type: ignore[
 
 
 @_step
-def primary(word, stay, alias):  # type: ignore[no-untyped-def]
+def primary(word, alias):  # type: ignore[no-untyped-def]
     """Number of a star, drawn in proportion to its multiplicity fraction by the alias table.
 
     The word times the number of stars: its whole part is the star, its fraction tells whether to stay.
     """
-    product = uint64(word) * uint64(stay.size)
+    product = uint64(word) * uint64(alias.shape[0])
     star = product >> uint64(32)
-    other = alias[star]  # looked up in any case: no branch
-    return int32(star) if unit(uint32(product)) < stay[star] else other
+    other = bits(alias[star, 1])  # looked up in any case: no branch
+    return int32(star) if unit(uint32(product)) < alias[star, 0] else other
 
 
 @_step
@@ -209,7 +211,7 @@ def single_star(tables, scale, key_low, key_high, stack_low, stack_high, draw): 
     while single < 0:
         words = philox(key_low, key_high, draw, SINGLE_STAGE, stack_low, stack_high)
         draw += 1
-        star = int64((uint64(words[0]) * uint64(tables.stay.size)) >> uint64(32))
+        star = int64((uint64(words[0]) * uint64(tables.alias.shape[0])) >> uint64(32))
         law = bits(tables.star[star, LAW])
         if uniform_pair(words[1], words[2]) >= scale * tables.law[law, FRACTION]:
             single = star
