@@ -55,12 +55,19 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "prediction": {"errors", "moments", "orbits", "photometry", "response", "systems"},
     "config": {"errors", "multiplicity", "photometry"},
     "sample": {"catalogs", "config", "errors", "galaxy", "stars", "systems"},
+    "tallies": set(),
+    "lock": {"errors"},
+    "store": {"config", "errors", "lock", "moments", "sample", "stars", "systems", "tallies"},
+    "cluster": {"errors"},
     "simulation": {
-        "config", "errors", "images", "moments", "psf", "response", "sample", "shapes", "stack", "stars", "systems",
+        "cluster", "config", "errors", "images", "moments", "psf", "response", "sample", "shapes", "stack", "store",
+        "systems", "tallies",
     },
-    "summary": {"config", "prediction", "psf", "response", "shapes", "systems"},
+    "summary": {"config", "prediction", "psf", "response", "shapes", "store", "systems", "tallies"},
     "io": {"files", "errors", "systems", "tables"},
-    "experiments": {"config", "galaxy", "multiplicity", "prediction", "simulation", "stars", "summary"},
+    "experiments": {
+        "config", "galaxy", "multiplicity", "prediction", "simulation", "stars", "store", "summary",
+    },
     "figures": {"instruments", "stars"},
     "report": {"files", "experiments", "figures", "instruments", "io", "summary"},
     "bench": {"config", "psf", "response", "sample", "shapes", "stack", "systems"},
@@ -68,8 +75,8 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "answers": {"catalogs", "config", "errors", "gaia", "prediction", "sample", "stars"},
     "cli": {
         "answers", "bench", "catalogs", "files", "figures", "config", "errors", "experiments", "gaia", "images", "io",
-        "kappa", "measurement", "prediction", "psf", "report", "response", "sample", "shapes", "simulation", "summary",
-        "systems", "terminal", "toy",
+        "kappa", "measurement", "prediction", "psf", "report", "response", "sample", "shapes", "simulation", "store",
+        "summary", "systems", "terminal", "toy",
     },
 }  # fmt: skip
 NEVER_REACHED = {  # followed through every module in between

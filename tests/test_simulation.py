@@ -10,7 +10,8 @@ from porrima.config import RunConfig, parse
 from porrima.errors import InputError
 from porrima.moments import INDICES
 from porrima.sample import draw_stars
-from porrima.simulation import open_run, simulate
+from porrima.simulation import simulate
+from porrima.store import open_run
 
 
 def small(**changes):

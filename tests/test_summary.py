@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from porrima.config import RunConfig, parse
-from porrima.simulation import open_run, simulate
+from porrima.simulation import simulate
+from porrima.store import open_run
 from porrima.summary import STATISTICS, predicted_curves, rows, statistics, summarise
 from statistics_helpers import assert_within_sigma
 
@@ -49,7 +50,7 @@ def test_no_change_at_all_has_no_error():
 
 
 def test_bins_hold_all_stacks_and_agree_with_prediction(run):
-    summary = summarise(*run, bins=5)
+    summary = summarise(run, bins=5)
     assert summary["n_stacks"].sum() == 20_000
     assert not np.any(summary["n_failed"])
     for name in ("bias", "sigma", "sd"):
@@ -57,7 +58,7 @@ def test_bins_hold_all_stacks_and_agree_with_prediction(run):
 
 
 def test_the_number_of_bins_does_not_move_the_truth(run):
-    one = summarise(*run, bins=1)
+    one = summarise(run, bins=1)
     assert_within_sigma(one["sigma"], one["prediction_sigma"], one["sigma_se"])
     # within one bin from 0 to 1 the bias itself varies: the prediction must hold its spread
     curves = predicted_curves(run[2], run[1], 40)
@@ -66,14 +67,14 @@ def test_the_number_of_bins_does_not_move_the_truth(run):
 
 
 def test_rows_have_the_keys_of_the_contract(run):
-    first = rows(summarise(*run, bins=4))[0]
+    first = rows(summarise(run, bins=4))[0]
     assert list(first) == ["psf", "quantity", "f_lo", "f_hi", "n_stacks", "n_failed", *STATISTICS]
     assert (first["psf"], first["quantity"], first["f_lo"], first["f_hi"]) == ("psf0", "r2", 0.0, 0.25)
 
 
 def test_a_fixed_fraction_fills_one_bin(tmp_path):
     simulate(config(n_stacks=500, binary_fraction=0.35), tmp_path / "run.zarr")
-    found = rows(summarise(*open_run(tmp_path / "run.zarr")))
+    found = rows(summarise(open_run(tmp_path / "run.zarr")))
     assert {(r["f_lo"], r["n_stacks"]) for r in found} == {(0.35, 500)}
     assert len(found) == 6
 
@@ -88,4 +89,4 @@ def test_stacks_that_could_not_be_measured_are_counted(run):
 
 def test_there_must_be_a_bin(run):
     with pytest.raises(ValueError, match="bins must be at least 1, got 0"):
-        summarise(*run, bins=0)
+        summarise(run, bins=0)
