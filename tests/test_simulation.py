@@ -37,7 +37,9 @@ def finished(tmp_path_factory):
 
 def test_a_store_has_the_dimensions_and_variables_of_the_contract(finished):
     run = xr.open_zarr(finished, chunks=None)
-    assert run.sizes == {"stack": 250, "psf": 3, "moment": len(INDICES), "star": 300}
+    assert {name: run.sizes[name] for name in ("stack", "psf", "moment", "star", "chunk")} == {
+        "stack": 250, "psf": 3, "moment": len(INDICES), "star": 300, "chunk": 3,
+    }  # fmt: skip
     assert run["psf"].to_numpy().tolist() == ["psf0", "psf1", "psf2"]
     assert run["moment"].to_numpy()[:3].tolist() == ["m20", "m11", "m02"]
     for name in ("e1", "e2", "r2"):
@@ -171,8 +173,8 @@ def test_stars_are_the_same_for_a_seed_and_others_for_another():
 
 
 def test_a_run_keeps_its_stars(finished):
-    _, config, population = open_run(finished)
-    np.testing.assert_array_equal(population.stars.distance, draw_stars(config).distance)
+    run = open_run(finished)
+    np.testing.assert_array_equal(run.population.stars.distance, draw_stars(run.config).distance)
 
 
 def test_no_star_in_the_range_is_an_error():

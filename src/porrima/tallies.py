@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba import njit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -165,28 +166,46 @@ def tally(binary_fraction: FloatArray, change: FloatArray, bins: int = FINE) -> 
     """
     edges = np.arange(bins + 1) / bins  # so that 0.35 is an edge of 20 bins
     which = np.clip(np.searchsorted(edges, binary_fraction, side="right") - 1, 0, bins - 1)
-    shape = (*change.shape[:2], bins)
-    measured = np.isfinite(change)
-    first = np.arange(shape[0] * shape[1]).reshape(*shape[:2], 1) * bins
-    cell = (first + which)[measured]
-    size = int(np.prod(shape))
-    count = np.bincount(cell, minlength=size)
+    values = np.zeros((*change.shape[:2], len(STATISTICS), bins))
+    values[:, :, 0] = np.bincount(which, minlength=bins)
+    _count(which, binary_fraction, np.ascontiguousarray(change), values)
+    return Tally.from_array(values)
 
-    def total(weights: FloatArray) -> FloatArray:
-        return np.bincount(cell, weights, minlength=size).astype(float, copy=False)
 
-    def centred(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        mean = total(values) / np.maximum(count, 1)
-        return mean, values - mean[cell]
+@njit(cache=True)
+def _count(which, fraction, change, values):  # type: ignore[no-untyped-def]
+    """Fill the statistics from the second on, (n_psf, 3, 8, n_bin), in two passes over each row of changes.
 
-    mean, x = centred(change[measured])
-    fraction, f = centred(np.broadcast_to(binary_fraction, change.shape)[measured])
-    fields = {
-        "count": count.astype(float), "mean": mean, "m2": total(x**2), "m3": total(x**3), "m4": total(x**4),
-        "fraction": fraction, "fraction_m2": total(f**2),
-    }  # fmt: skip
-    n_stacks = np.broadcast_to(np.bincount(which, minlength=bins).astype(float), shape)
-    return Tally(n_stacks=n_stacks, **{name: values.reshape(shape) for name, values in fields.items()})
+    The first pass finds the mean but for its rounding, which the second measures and takes out.
+    """
+    for p in range(change.shape[0]):
+        for q in range(change.shape[1]):
+            row, out = change[p, q], values[p, q]
+            for s in range(row.size):
+                if np.isfinite(row[s]):
+                    out[1, which[s]] += 1.0
+                    out[2, which[s]] += row[s]
+                    out[6, which[s]] += fraction[s]
+            for k in range(out.shape[1]):
+                if out[1, k] > 0.0:
+                    out[2, k] /= out[1, k]
+                    out[6, k] /= out[1, k]
+            rounding = np.zeros(out.shape[1])
+            for s in range(row.size):
+                if np.isfinite(row[s]):
+                    k = which[s]
+                    d, f = row[s] - out[2, k], fraction[s] - out[6, k]
+                    rounding[k] += d
+                    out[3, k] += d * d
+                    out[4, k] += d * d * d
+                    out[5, k] += d * d * d * d
+                    out[7, k] += f * f
+            for k in range(out.shape[1]):
+                if out[1, k] > 0.0:
+                    e = rounding[k] / out[1, k]
+                    out[2, k] += e
+                    out[5, k] -= 4.0 * e * out[4, k]
+                    out[4, k] -= 3.0 * e * out[3, k]
 
 
 def merged(parts: Tally) -> Tally:
