@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import islice
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numba
@@ -155,7 +156,7 @@ def cluster(workers: int | None, scheduler: str | None) -> Iterator[Cluster | No
         raise InputError("needs Dask: install porrima[cluster]", key="workers") from None
     with ExitStack() as stack:
         try:
-            where = scheduler or stack.enter_context(_local(workers or 1))
+            where = stack.enter_context(_local(workers or 1)) if scheduler is None else scheduler
             client = stack.enter_context(Client(where, timeout="10s"))
         except (OSError, ValueError, ImportError) as error:  # ImportError: of an unknown protocol, say
             raise InputError(f"cannot be reached ({error})", key="scheduler", value=scheduler) from None
@@ -166,18 +167,24 @@ def cluster(workers: int | None, scheduler: str | None) -> Iterator[Cluster | No
 
 @contextmanager
 def _local(workers: int) -> Iterator[Any]:
-    """A cluster of this machine.  Its processes do not see Ctrl-C: the one that made them ends them."""
-    from dask.distributed import LocalCluster  # noqa: PLC0415  (an extra)
+    """A cluster of this machine, whose processes do not see Ctrl-C: the one that made them ends them.
+
+    Dask takes a worker that is away for 15 s for lost, also one that is just being started anew after its death.
+    """
+    import dask  # noqa: PLC0415  (an extra)
+    from dask.distributed import LocalCluster  # noqa: PLC0415
     from dask.system import CPU_COUNT  # noqa: PLC0415
 
     options = {"n_workers": workers, "threads_per_worker": max(1, CPU_COUNT // workers), "processes": True}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        here = LocalCluster(**options, dashboard_address=None, silence_logs=logging.ERROR)
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    with here:
-        yield here
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}):
+        resource_tracker.ensure_running()  # which would undo the mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # threads and processes inherit it
+        try:
+            here = LocalCluster(**options, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        with here:
+            yield here
 
 
 def _versions() -> dict[str, str]:

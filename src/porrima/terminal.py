@@ -54,9 +54,15 @@ class Progress:
         if sys.stderr.isatty():
             self._bar.start()
             self._bar.update(self._task, completed=self._done, description=self._words(now))
-        elif now - self._told_at >= _QUIET and self._done - self._told >= _STEP * self._total:
+        elif self._due(now):
             self._told, self._told_at = self._done, now
             print(f"{self._done} of {self._total} {self._words(now)}", file=sys.stderr, flush=True)
+
+    def _due(self, now: float) -> bool:
+        """Whether it is time for a line; what began to tell also tells its end."""
+        if self._done >= self._total:
+            return self._told > 0
+        return now - self._told_at >= _QUIET and self._done - self._told >= _STEP * self._total
 
     def _words(self, now: float) -> str:
         new, elapsed = self._done - self._before, now - self._start
