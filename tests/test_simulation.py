@@ -92,7 +92,7 @@ def test_workers_write_where_they_see_the_store_and_else_the_client_does(
     by_worker, write = [], Store.write
 
     def noted(store, chunk):
-        by_worker.append(threading.current_thread().name.startswith("Dask-Default-Threads"))
+        by_worker.append(threading.current_thread() is not threading.main_thread())
         write(store, chunk)
 
     monkeypatch.setattr(Store, "write", noted)
@@ -184,7 +184,7 @@ def test_kills_at_random_moments_of_a_run_change_no_byte(long_run, tmp_path):
     process = started(file, path)
     out, err = process.communicate()
     assert process.returncode == 0, err
-    assert 0 < json.loads(out)["n_stacks_computed"] < 10_000 - 25 * 200
+    assert 0 < json.loads(out)["n_stacks_computed"] <= 10_000 - 25 * 200
     assert contents(path) == contents(whole)
 
 

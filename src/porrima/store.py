@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import socket
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -159,13 +161,14 @@ class Store:
         some = slice(chunk.first, chunk.first + chunk.binary_fraction.size)
         number = chunk.first // self.group["binary_fraction"].chunks[0]
         try:
-            self.group["binary_fraction"][some] = chunk.binary_fraction
-            for q, name in enumerate(QUANTITIES):
-                self.group[name][:, some] = chunk.shapes[q]
-            self.group["moments"][some] = chunk.moments
-            self._to_disk(number, [name for name in _FILES if name != _MARKER])
-            self.group[_MARKER][number] = chunk.tally.to_array()
-            self._to_disk(number, [_MARKER])
+            with _uninterrupted():
+                self.group["binary_fraction"][some] = chunk.binary_fraction
+                for q, name in enumerate(QUANTITIES):
+                    self.group[name][:, some] = chunk.shapes[q]
+                self.group["moments"][some] = chunk.moments
+                self._to_disk(number, [name for name in _FILES if name != _MARKER])
+                self.group[_MARKER][number] = chunk.tally.to_array()
+                self._to_disk(number, [_MARKER])
         except OSError as error:
             raise _stopped(self.path, error) from None
 
@@ -405,8 +408,9 @@ def _create(path: Path, known: xr.Dataset, n_stacks: int, chunk: int) -> None:
     """Make an empty store beside its place, and move it there."""
     unfinished = path.with_name(f".{path.name}.{os.getpid()}@{socket.gethostname()}")
     try:
-        _lay_out(unfinished, known, n_stacks, min(chunk, n_stacks))
-        unfinished.rename(path)
+        with _uninterrupted():
+            _lay_out(unfinished, known, n_stacks, min(chunk, n_stacks))
+            unfinished.rename(path)
     except OSError as error:
         if path.exists():
             raise InputError("was made by another process just now", key="output", value=path) from None
@@ -453,6 +457,28 @@ def _written(path: Path) -> set[int]:
     """Numbers of the chunks that are complete."""
     names = os.listdir(path / _MARKER)
     return {int(name.split(".")[0]) for name in names if name[0].isdigit() and name.endswith(".0")}
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C wait until Zarr's threads have written what they are at; a second one does not."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    asked: list[int] = []
+
+    def wait(number: int, _: Any) -> None:
+        asked.append(number)
+        if len(asked) > 1:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, wait)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before or signal.SIG_DFL)
+    if asked:
+        raise KeyboardInterrupt
 
 
 def _sync(path: Path) -> None:
