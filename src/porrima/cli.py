@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import _thread
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.exceptions import TyperException
@@ -370,6 +372,7 @@ def main() -> None:
     """
     arguments = sys.argv[1:] or ["--help"]
     warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
+    unraisable, sys.unraisablehook = sys.unraisablehook, _interrupt_again
     try:
         code = typer.main.get_command(app).main(arguments, prog_name="porrima", standalone_mode=False)
     except InputError as error:
@@ -380,9 +383,19 @@ def main() -> None:
         code = _fail(error.format_message(), 2)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED
+    finally:
+        sys.unraisablehook = unraisable
     if code == _INTERRUPTED:
         code = _fail("interrupted; --resume goes on with a run", 1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _interrupt_again(lost: Any) -> None:
+    """A Ctrl-C that came where no exception can be raised, as while compiled code is being loaded, comes again."""
+    if lost.exc_type is KeyboardInterrupt:
+        threading.Timer(0.1, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _fail(message: str, code: int) -> int:
