@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import xarray as xr
 
 from porrima import cli
 from porrima.catalogs import read_catalog
+from porrima.errors import RunError
 
 PREDICT_KEYS = {
     "mean_x", "mean_x2", "eta", "bias_e1", "bias_e2", "bias_r2", "sigma_e1", "sigma_e2", "sigma_r2", "sd_e1", "sd_e2",
@@ -325,3 +327,28 @@ def test_an_interruption_is_not_wrong_input(porrima, monkeypatch, config, tmp_pa
     code, _, err = porrima("simulate", config, "-o", tmp_path / "run.zarr")
     assert code == 1
     assert "error: interrupted" in err
+
+
+def test_an_interruption_that_is_lost_in_a_callback_comes_again(porrima, monkeypatch, config, tmp_path):
+    class Deaf:
+        def __del__(self):
+            raise KeyboardInterrupt
+
+    def loading(*_, **__):
+        del [Deaf()][0]
+        time.sleep(10)
+
+    monkeypatch.setattr("porrima.simulation.simulate", loading)
+    start = time.monotonic()
+    code, _, err = porrima("simulate", config, "-o", tmp_path / "run.zarr")
+    assert (code, err) == (1, "error: interrupted; --resume goes on with a run\n")
+    assert time.monotonic() - start < 5
+
+
+def test_a_run_that_had_to_stop_is_not_wrong_input(porrima, monkeypatch, config, tmp_path):
+    def stopped(*_, **__):
+        raise RunError("run.zarr: cannot be written (No space left on device)")
+
+    monkeypatch.setattr("porrima.simulation.simulate", stopped)
+    code, out, err = porrima("simulate", config, "-o", tmp_path / "run.zarr")
+    assert (code, out, err) == (1, "", "error: run.zarr: cannot be written (No space left on device)\n")

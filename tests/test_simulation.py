@@ -1,16 +1,25 @@
 import json
+import resource
 import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
 
 import numpy as np
 import pytest
 import xarray as xr
+from dask.distributed import LocalCluster
 
 from porrima import simulation
-from porrima.config import RunConfig, parse
-from porrima.errors import InputError
+from porrima.config import RunConfig, canonical, load, parse
+from porrima.errors import InputError, RunError
+from porrima.lock import locked
 from porrima.moments import INDICES
 from porrima.sample import draw_stars
-from porrima.simulation import open_run, simulate
+from porrima.simulation import simulate
+from porrima.store import Chunk, Store, open_run
 
 
 def small(**changes):
@@ -36,7 +45,9 @@ def finished(tmp_path_factory):
 
 def test_a_store_has_the_dimensions_and_variables_of_the_contract(finished):
     run = xr.open_zarr(finished, chunks=None)
-    assert run.sizes == {"stack": 250, "psf": 3, "moment": len(INDICES), "star": 300}
+    assert {name: run.sizes[name] for name in ("stack", "psf", "moment", "star", "chunk")} == {
+        "stack": 250, "psf": 3, "moment": len(INDICES), "star": 300, "chunk": 3,
+    }  # fmt: skip
     assert run["psf"].to_numpy().tolist() == ["psf0", "psf1", "psf2"]
     assert run["moment"].to_numpy()[:3].tolist() == ["m20", "m11", "m02"]
     for name in ("e1", "e2", "r2"):
@@ -67,7 +78,42 @@ def test_workers_give_the_same_bytes(finished, tmp_path):
     assert contents(tmp_path / "run.zarr") == contents(finished)
 
 
-@pytest.mark.parametrize("lost", ["moments/1.0", "moments/2.0"])
+@pytest.fixture(scope="module")
+def threads_as_workers():
+    """Scheduler and workers in this process, so that a test can see and change what a worker does."""
+    with LocalCluster(n_workers=2, threads_per_worker=2, processes=False, dashboard_address=":0") as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.mark.parametrize("reached", [True, False])
+def test_workers_write_where_they_see_the_store_and_else_the_client_does(
+    finished, tmp_path, monkeypatch, threads_as_workers, reached
+):
+    by_worker, write = [], Store.write
+
+    def noted(store, chunk):
+        by_worker.append(threading.current_thread() is not threading.main_thread())
+        write(store, chunk)
+
+    monkeypatch.setattr(Store, "write", noted)
+    if not reached:
+        monkeypatch.setattr(Store, "within_reach", lambda path, token: None)
+    simulate(small(), tmp_path / "run.zarr", chunk=100, scheduler=threads_as_workers)
+    assert by_worker == [reached] * 3
+    assert contents(tmp_path / "run.zarr") == contents(finished)
+
+
+def test_a_worker_of_a_process_that_has_died_leaves_another_run_alone(finished, tmp_path):
+    path = tmp_path / "run.zarr"
+    shutil.copytree(finished, path)
+    run = simulation._Run.of(small(seed=4), open_run(path).population, "moments")
+    with locked(path):
+        result = simulation._write_there(run, path, "token of the dead", 0, 100)
+    assert isinstance(result, Chunk)
+    assert contents(path) == contents(finished)
+
+
+@pytest.mark.parametrize("lost", ["tally/1.0.0.0.0", "tally/2.0.0.0.0"])
 def test_an_interrupted_run_is_resumed_to_the_same_bytes(finished, tmp_path, lost):
     path = tmp_path / "run.zarr"
     shutil.copytree(finished, path)
@@ -79,23 +125,82 @@ def test_an_interrupted_run_is_resumed_to_the_same_bytes(finished, tmp_path, los
     assert contents(path) == contents(finished)
 
 
-def test_a_kill_at_any_write_loses_one_chunk_at_most(finished, tmp_path, monkeypatch):
+def test_an_interruption_inside_a_chunk_loses_that_chunk_only(finished, tmp_path, monkeypatch):
     path, done = tmp_path / "run.zarr", []
-    write = simulation._write_chunk
+    write = Store.write
 
-    def killed(store, path, chunk):
+    def interrupted(store, chunk):
         if len(done) == 1:
-            store["e1"][:, chunk.first : chunk.last] = -7.0  # half of a chunk
+            store.group["e1"][:, chunk.first : chunk.first + 100] = -7.0  # half of a chunk
             raise KeyboardInterrupt
         done.append(chunk.first)
-        write(store, path, chunk)
+        write(store, chunk)
 
-    monkeypatch.setattr(simulation, "_write_chunk", killed)
+    monkeypatch.setattr(Store, "write", interrupted)
     with pytest.raises(KeyboardInterrupt):
         simulate(small(), path, chunk=100)
     monkeypatch.undo()
     assert simulate(small(), path, resume=True) == 150
     assert contents(path) == contents(finished)
+
+
+COMMAND = [sys.executable, "-c", "from porrima.cli import main; main()", "simulate"]
+
+
+def started(config, path, *options):
+    """The command itself, as its own process."""
+    arguments = [str(config), "-o", str(path), "--resume", "--json", *options]
+    return subprocess.Popen([*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for_chunks(path, n, process):
+    """Until n chunks are there; the process must still be at work."""
+    while len(list((path / "tally").glob("*.0"))) < n:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def long_run(tmp_path):
+    """Configuration of some hundred chunks, and what an uninterrupted run makes of it."""
+    file = tmp_path / "run.yaml"
+    config = small(n_stacks=10_000, psf="psf0", estimator="plain")
+    file.write_text(canonical(config))
+    simulate(load(file), tmp_path / "whole.zarr", chunk=25)
+    return file, tmp_path / "whole.zarr"
+
+
+def test_kills_at_random_moments_of_a_run_change_no_byte(long_run, tmp_path):
+    file, whole = long_run
+    path, rng = tmp_path / "run.zarr", np.random.Generator(np.random.Philox(5))
+    for kill in range(4):
+        process = started(file, path, "--chunk", "25")
+        wait_for_chunks(path, 60 * kill + 20, process)
+        time.sleep(rng.uniform(0, 0.05))
+        process.kill()
+        process.communicate()
+        with pytest.raises(InputError, match="is not complete"):
+            open_run(path)
+    process = started(file, path)
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    assert 0 < json.loads(out)["n_stacks_computed"] <= 10_000 - 25 * 200
+    assert contents(path) == contents(whole)
+
+
+def test_ctrl_c_says_in_one_line_how_to_go_on(long_run, tmp_path):
+    file, whole = long_run
+    path = tmp_path / "run.zarr"
+    process = started(file, path, "--chunk", "25")
+    wait_for_chunks(path, 20, process)
+    with pytest.raises(InputError, match=rf"is being written by process {process.pid} on "):
+        simulate(load(file), path, resume=True)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate()
+    assert (process.returncode, out) == (1, "")
+    assert err == "error: interrupted; --resume goes on with a run\n"
+    simulate(load(file), path, resume=True)
+    assert contents(path) == contents(whole)
 
 
 def test_a_finished_run_is_left_alone(finished, tmp_path):
@@ -126,6 +231,24 @@ def test_a_psf_whose_file_has_changed_does_not_mix(tmp_path):
     psf.write_text("psf: {type: Gaussian, fwhm: 0.15}\n")
     with pytest.raises(InputError, match="holds a run of another configuration"):
         simulate(config, tmp_path / "run.zarr", resume=True)
+
+
+def test_a_full_disk_stops_the_run_and_leaves_it_whole(finished, tmp_path):
+    """A limit on the size of files stands for the full disk: the kernel refuses the largest file of a chunk."""
+    path, before = tmp_path / "run.zarr", resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def limited(n):
+        if n:  # one chunk is there
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+
+    try:
+        with pytest.raises(RunError, match=r"run\.zarr: cannot be written \(File too large\); .* --resume"):
+            simulate(small(), path, chunk=100, progress=limited)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(path.rglob("*.partial"))
+    assert simulate(small(), path, resume=True) == 150
+    assert contents(path) == contents(finished)
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
@@ -170,8 +293,8 @@ def test_stars_are_the_same_for_a_seed_and_others_for_another():
 
 
 def test_a_run_keeps_its_stars(finished):
-    _, config, population = open_run(finished)
-    np.testing.assert_array_equal(population.stars.distance, draw_stars(config).distance)
+    run = open_run(finished)
+    np.testing.assert_array_equal(run.population.stars.distance, draw_stars(run.config).distance)
 
 
 def test_no_star_in_the_range_is_an_error():

@@ -48,6 +48,7 @@ BINARY_FRACTION = 0.35
 PSF_NAMES = ("psf1", "optical1")
 """A Gaussian, and a diffraction pattern of the same shape."""
 
+_CHUNK = CHUNK["moments"]
 _STARS_AT_ONCE = 1 << 15  # that a peer draws before it makes images: its arrays stay in the cache
 _COST = {  # rough seconds per stack and per star, on one core or on all threads: they only size what is timed
     "moments": (4e-7, 3e-9),
@@ -194,8 +195,8 @@ def _chunks(
     draw: Callable[..., Any], population: Population, n_stars: int, n_stacks: int, seed: int
 ) -> Iterator[Any]:
     """Stacks as a run draws them, a chunk at a time."""
-    for first in range(0, n_stacks, CHUNK):
-        last = min(first + CHUNK, n_stacks)
+    for first in range(0, n_stacks, _CHUNK):
+        last = min(first + _CHUNK, n_stacks)
         yield draw(
             population, n_stars=n_stars, binary_fraction=BINARY_FRACTION, seed=seed, first=first, last=last
         )
@@ -343,8 +344,8 @@ def _shape_speeds(population: Population, team: _Team, psf: str, sizes: Sizes) -
     """Shapes per second: the response, Porrima's own measurement of stamps, and HSM, for stacks of 40 stars."""
     reply, scale = response(psf_from_name(psf), Adaptive()), psf_from_name(psf).scale
     n_stacks, n_stamps = round(sizes.seconds / 1e-6), max(8, round(sizes.seconds / 4e-4))
-    moments = next(_chunks(draw_stacks, population, 40, min(n_stacks, CHUNK), team.seed)).moments
-    calls = max(1, n_stacks // CHUNK)
+    moments = next(_chunks(draw_stacks, population, 40, min(n_stacks, _CHUNK), team.seed)).moments
+    calls = max(1, n_stacks // _CHUNK)
     images = _stamps(psf, n_stamps, team.seed)
     tasks: dict[str, Callable[[], float]] = {
         "response": lambda: seconds_of(lambda: [reply.shapes(moments) for _ in range(calls)]),

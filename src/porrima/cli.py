@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.exceptions import TyperException
 
-from porrima.errors import InputError
+from porrima.errors import InputError, RunError
 from porrima.terminal import Progress, show
 
 __all__ = ["app", "main"]
@@ -202,7 +204,9 @@ def simulate(
     ] = "moments",
     workers: Annotated[int | None, typer.Option(help="Processes of a local Dask cluster.", min=1)] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
-    chunk: Annotated[int, typer.Option(help="Stacks per chunk.", min=1)] = 10_000,
+    chunk: Annotated[
+        int | None, typer.Option(help="Stacks per chunk; 10000, or 100 of images.", min=1)
+    ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Instead of that of the configuration.")] = None,
     example: Annotated[bool, typer.Option("--example", help="Print a configuration.")] = False,
     as_json: Json = False,
@@ -225,7 +229,7 @@ def simulate(
     from porrima.simulation import simulate as simulated
 
     start = time.perf_counter()
-    with Progress(run.n_stacks, "stacks") as progress:
+    with Progress(run.n_stacks, "stacks", ("stars", run.n_stars)) as progress:
         done = simulated(
             run, output, resume=resume, method=method, chunk=chunk, workers=workers, scheduler=scheduler,
             progress=progress.advance,
@@ -252,12 +256,12 @@ def summary(
     """Bias and error per range of binary fraction, with standard errors and predictions."""
     from porrima.answers import NUMBER_COLUMNS, number_lines
     from porrima.io import write_rows
-    from porrima.simulation import open_run
+    from porrima.store import open_run
     from porrima.summary import rows, summarise
 
     if bins < 1:
         raise InputError("must be at least 1", key="--bins", value=bins)
-    result = rows(summarise(*open_run(run), bins=bins))
+    result = rows(summarise(open_run(run), bins=bins))
     if output is not None:
         write_rows(result, output)
     failed = max((row["n_failed"] / row["n_stacks"] for row in result), default=0.0)
@@ -286,7 +290,7 @@ def paper(
     config = paper_config(full=full, seed=seed)
     make_folder(output)
     start = time.perf_counter()
-    with Progress(config.n_stacks, "stacks") as progress:
+    with Progress(config.n_stacks, "stacks", ("stars", config.n_stars)) as progress:
         numbers = errors_and_biases(config, output / f"run-{config.n_stacks}-{seed}.zarr", progress.advance)
     report = write_report(numbers, output)
     result = {
@@ -377,17 +381,31 @@ def main() -> None:
     """
     arguments = sys.argv[1:] or ["--help"]
     warnings.showwarning = lambda message, *_: print(f"warning: {message}", file=sys.stderr)
+    unraisable, sys.unraisablehook = sys.unraisablehook, _interrupt_again
     try:
         code = typer.main.get_command(app).main(arguments, prog_name="porrima", standalone_mode=False)
     except InputError as error:
         code = _fail(str(error), 2)
+    except RunError as error:
+        code = _fail(str(error), 1)
     except TyperException as error:
         code = _fail(error.format_message(), 2)
     except (KeyboardInterrupt, typer.Abort):
         code = _INTERRUPTED
+    finally:
+        sys.unraisablehook = unraisable
     if code == _INTERRUPTED:
         code = _fail("interrupted; --resume goes on with a run", 1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _interrupt_again(lost: Any) -> None:
+    """A Ctrl-C that came where no exception can be raised, as while compiled code is being loaded, comes again."""
+    if lost.exc_type is KeyboardInterrupt:
+        main_thread = threading.main_thread().ident or 0
+        threading.Timer(0.1, signal.pthread_kill, (main_thread, signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 def _fail(message: str, code: int) -> int:

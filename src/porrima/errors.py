@@ -1,10 +1,10 @@
-"""The one error that a user's input can raise."""
+"""The one error that a user's input can raise, and the one that stops a run."""
 
 from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["InputError"]
+__all__ = ["InputError", "RunError"]
 
 
 class InputError(ValueError):
@@ -44,3 +44,16 @@ class InputError(ValueError):
         got = f", got {value}" if value is not None else ""
         text = f"{place}: {rule}{got}" if place else f"{rule}{got}"
         super().__init__(" ".join(text.split()))
+
+
+class RunError(RuntimeError):
+    """What stops a run and is no fault of its input, such as a full disk: one line that names the place.
+
+    Parameters
+    ----------
+    message : str
+        What happened; what is written stays whole, and the line says how to go on.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))

@@ -11,7 +11,8 @@ from porrima.config import RunConfig, parse
 from porrima.galaxy import Robin2003
 from porrima.multiplicity import DucheneKraus2013
 from porrima.prediction import integrate, population_moments
-from porrima.simulation import open_run, simulate
+from porrima.simulation import simulate
+from porrima.store import open_run
 from porrima.summary import predicted_curves, summarise
 
 if TYPE_CHECKING:
@@ -115,14 +116,15 @@ def errors_and_biases(
         All that the figure shows.
     """
     simulate(config, store, resume=store.exists(), progress=progress)
-    run, config, population = open_run(store)
+    run = open_run(store)
+    config, population = run.config, run.population
     integrals = integrate(population)
     moments = population_moments(population, integrals, np.array([0.35]))
     curves = predicted_curves(population, config, config.n_stars, integrals=integrals)
     curves.attrs["n_stars"] = config.n_stars
     return ErrorsAndBiases(
         config=config,
-        summary=summarise(run, config, population, integrals=integrals),
+        summary=summarise(run, integrals=integrals),
         curves=curves,
         limit=predicted_curves(population, config, None, integrals=integrals),
         mean_x=float(moments.mean_x[0]),

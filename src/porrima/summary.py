@@ -1,4 +1,7 @@
-"""From many stacks to numbers: bias and error with their standard errors, per range of binary fraction."""
+"""From many stacks to numbers: bias and error with their standard errors, per range of binary fraction.
+
+The stacks are not all in memory at any time: what is needed of them is in the tallies of their chunks.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,16 @@ from porrima.prediction import QUANTITIES, integrate, population_moments, predic
 from porrima.psf import psf_from_name
 from porrima.response import response
 from porrima.shapes import estimator_from_name
+from porrima.tallies import Tally, changes, fine_bins, merged, tally
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from porrima.config import RunConfig
     from porrima.prediction import PairIntegrals
+    from porrima.store import FinishedRun
     from porrima.systems import Population
 
     FloatArray = NDArray[np.float64]
@@ -29,48 +36,61 @@ STATISTICS = (
 )  # fmt: skip
 """What is given for each PSF, quantity and bin."""
 
-_FRACTIONS = 1001  # nodes of the predicted curves between 0 and 1
+_NODES = 1001  # of the predicted curves between 0 and 1
+_BLOCK = 16  # tallies read at once
+_STACKS = 10_000  # stacks read at once, where there is no tally of them
 
 
-def statistics(change: FloatArray) -> dict[str, float]:
-    r"""Bias and errors of a measured quantity over stacks, with standard errors.
+def statistics(counted: Tally) -> dict[str, FloatArray]:
+    r"""Bias and errors of measured quantities over stacks, with standard errors.
 
     Parameters
     ----------
-    change : (n,) float array
-        Value of each stack minus that of the PSF without companions; for the size over that of the PSF,
-        dimensionless; n at least 2.
+    counted : Tally
+        Of the changes of each range of binary fraction, dimensionless.
 
     Returns
     -------
     statistics : dict
-        ``bias``, ``sigma`` (rms about no change), ``sd`` (about the mean) and the standard error of each.
+        ``bias``, ``sigma`` (rms about no change), ``sd`` (about the mean) and the standard error of each, each a
+        (n_psf, 3, n_bin) array; NaN where fewer than two stacks are left.
 
     Notes
     -----
     :math:`\sigma^2 = \sum_s \delta_s^2 / (N_s - 1)` (KCM16, Eq. 10).  The companions' x is heavy-tailed, so the
-    standard errors take the fourth moment of the sample:
-    :math:`var(s^2) = [m_4 - s^4 (n-3)/(n-1)]/n`, halved over s.
+    standard errors take the fourth moment of the sample: with central sums :math:`M_k` and the mean :math:`\mu`,
+    :math:`var(s^2) = [M_4/n - s^4 (n-3)/(n-1)]/n`, and
+    :math:`(n - 1)\, var(\delta^2) = M_4 - M_2^2/n + 4\mu M_3 + 4\mu^2 M_2`; the standard error of a root is that of
+    its square over twice the root.
 
     References
     ----------
     KCM16
     """
-    n = change.size
-    bias = change.mean()
-    centred = change - bias
-    variance = centred @ centred / (n - 1)
-    variance_of_variance = max(np.mean(centred**4) - variance**2 * (n - 3) / (n - 1), 0.0) / n
-    square = change**2
-    sigma = np.sqrt(square.sum() / (n - 1))
+    enough = counted.count >= 2
+    n = np.where(enough, counted.count, np.nan)
+    mean, m2, m3, m4 = counted.mean, counted.m2, counted.m3, counted.m4
+    variance = m2 / (n - 1)
+    variance_of_variance = np.maximum(m4 / n - variance**2 * (n - 3) / (n - 1), 0.0) / n
+    square = (m2 + n * mean**2) / (n - 1)
+    of_squares = np.maximum(m4 - m2**2 / n + 4 * mean * m3 + 4 * mean**2 * m2, 0.0)
+    variance_of_square = of_squares / (n - 1) / n
     return {
-        "bias": bias,
+        "bias": np.where(enough, mean, np.nan),
         "bias_se": np.sqrt(variance / n),
-        "sigma": sigma,
-        "sigma_se": square.std(ddof=1) / np.sqrt(n) / (2 * sigma) if sigma > 0 else 0.0,
+        "sigma": np.sqrt(square),
+        "sigma_se": _of_root(variance_of_square, square),
         "sd": np.sqrt(variance),
-        "sd_se": np.sqrt(variance_of_variance) / (2 * np.sqrt(variance)) if variance > 0 else 0.0,
+        "sd_se": _of_root(variance_of_variance, variance),
     }
+
+
+def _of_root(variance: FloatArray, square: FloatArray) -> FloatArray:
+    """Standard error of the root of a number with this variance; 0 where the number is."""
+    root = 2 * np.sqrt(square)
+    out: FloatArray = np.where(np.isnan(root), root, 0.0)
+    np.divide(np.sqrt(variance), root, out=out, where=root > 0)
+    return out
 
 
 def predicted_curves(
@@ -100,7 +120,7 @@ def predicted_curves(
     curves : Dataset
         ``bias``, ``sd``, ``sigma`` over (psf, quantity, binary_fraction), dimensionless.
     """
-    grid = np.linspace(0.0, 1.0, _FRACTIONS) if fractions is None else fractions
+    grid = np.linspace(0.0, 1.0, _NODES) if fractions is None else fractions
     moments = population_moments(population, integrals or integrate(population), grid)
     estimator = estimator_from_name(config.estimator)
     psfs = [psf_from_name(name, **config.psf_options) for name in config.psf]
@@ -115,23 +135,13 @@ def predicted_curves(
     )
 
 
-def summarise(
-    run: xr.Dataset,
-    config: RunConfig,
-    population: Population,
-    bins: int = 20,
-    integrals: PairIntegrals | None = None,
-) -> xr.Dataset:
+def summarise(run: FinishedRun, bins: int = 20, integrals: PairIntegrals | None = None) -> xr.Dataset:
     """Bias and error in bins of binary fraction, with what is predicted for the same stacks.
 
     Parameters
     ----------
-    run : Dataset
-        As `simulation.open_run` gives it.
-    config : RunConfig
-        Of the run.
-    population : Population
-        Of the run.
+    run : FinishedRun
+        From `store.open_run`.
     bins : int
         Number of equal ranges between 0 and 1 (count), at least 1.
     integrals : PairIntegrals, optional
@@ -151,34 +161,23 @@ def summarise(
     Notes
     -----
     A prediction is averaged over the binary fractions of the bin's own stacks: the mean of the bias, and by
-    the law of total variance the mean of the variance plus the variance of the bias.
+    the law of total variance the mean of the variance plus the variance of the bias.  Where `bins` divides
+    `tallies.FINE`, the tallies in the store say all and no stack is read.
     """
     if bins < 1:
         raise ValueError(f"bins must be at least 1, got {bins}")
-    fraction = run["binary_fraction"].to_numpy()
-    edges = np.arange(bins + 1) / bins  # so that 0.35 is an edge of 20 bins
-    which = np.clip(np.searchsorted(edges, fraction, side="right") - 1, 0, bins - 1)
-    curves = _at_stacks(population, config, fraction, integrals)
-    out = {name: np.full((len(config.psf), len(QUANTITIES), bins), np.nan) for name in STATISTICS}
-    n_stacks, n_failed = np.bincount(which, minlength=bins), np.zeros((len(config.psf), bins), dtype=int)
-    members = np.split(np.argsort(which, kind="stable"), np.cumsum(n_stacks)[:-1])
-    for p in range(len(config.psf)):
-        for q, quantity in enumerate(QUANTITIES):
-            change = run[quantity][p].to_numpy() - float(run[f"{quantity}_0"][p])
-            if quantity == "r2":
-                change /= float(run["r2_0"][p])
-            for k, everyone in enumerate(members):
-                inside = everyone[np.isfinite(change[everyone])]
-                n_failed[p, k] = everyone.size - inside.size
-                if inside.size >= 2:
-                    predicted = _average(curves["bias"][p, q, inside], curves["sd"][p, q, inside])
-                    for name, value in (statistics(change[inside]) | predicted).items():
-                        out[name][p, q, k] = value
+    fine = _tally_of(run, fine_bins(bins))
+    coarse, edges = fine.rebinned(bins), np.arange(bins + 1) / bins
+    numbers = statistics(coarse) | _predictions(run, fine, bins, integrals)
+    n_failed = coarse.n_stacks[:, -1] - coarse.count[:, -1]
     return xr.Dataset(
-        {name: (("psf", "quantity", "bin"), values) for name, values in out.items()}
-        | {"n_stacks": ("bin", n_stacks), "n_failed": (("psf", "bin"), n_failed)},
+        {name: (("psf", "quantity", "bin"), numbers[name]) for name in STATISTICS}
+        | {
+            "n_stacks": ("bin", coarse.n_stacks[0, 0].astype(int)),
+            "n_failed": (("psf", "bin"), n_failed.astype(int)),
+        },
         coords={
-            "psf": list(config.psf),
+            "psf": list(run.config.psf),
             "quantity": list(QUANTITIES),
             "f_lo": ("bin", edges[:-1]),
             "f_hi": ("bin", edges[1:]),
@@ -217,25 +216,63 @@ def rows(summary: xr.Dataset) -> list[dict[str, Any]]:
     ]
 
 
-def _at_stacks(
-    population: Population, config: RunConfig, fraction: FloatArray, integrals: PairIntegrals | None
+def _tally_of(run: FinishedRun, bins: int) -> Tally:
+    """Tally of all stacks of a run in that many ranges, some chunks at a time and always in the same order."""
+    blocks = _stored(run.dataset) if bins == run.dataset.sizes.get("bin") else _counted(run.dataset, bins)
+    total = next(blocks)
+    for block in blocks:
+        total = merged(Tally.from_array(np.stack([total.to_array(), block.to_array()])))
+    return total
+
+
+def _stored(dataset: xr.Dataset) -> Iterator[Tally]:
+    """Tallies that the store keeps, some chunks as one."""
+    for first in range(0, dataset.sizes["chunk"], _BLOCK):
+        yield merged(Tally.from_array(dataset["tally"][first : first + _BLOCK].to_numpy()))
+
+
+def _counted(dataset: xr.Dataset, bins: int) -> Iterator[Tally]:
+    """Tallies counted now, from some stacks after the others."""
+    alone = np.stack([dataset[f"{name}_0"].to_numpy() for name in QUANTITIES])
+    chunk = dataset["binary_fraction"].encoding.get("chunks", (_STACKS,))[0]
+    step = chunk * -(-_STACKS // chunk)
+    for first in range(0, dataset.sizes["stack"], step):
+        some = slice(first, first + step)
+        shapes = np.stack([dataset[name][:, some].to_numpy() for name in QUANTITIES])
+        yield tally(dataset["binary_fraction"][some].to_numpy(), changes(shapes, alone), bins)
+
+
+def _predictions(
+    run: FinishedRun, fine: Tally, bins: int, integrals: PairIntegrals | None
 ) -> dict[str, FloatArray]:
-    """Predicted bias and sd, (psf, quantity, stack)."""
-    grid = np.unique(fraction) if np.ptp(fraction) == 0 else None
-    curves = predicted_curves(population, config, config.n_stars, grid, integrals)
-    nodes = curves["binary_fraction"].to_numpy()
-    return {
-        name: np.stack(
-            [[np.interp(fraction, nodes, line) for line in psf] for psf in curves[name].to_numpy()]
-        )
-        for name in ("bias", "sd")
-    }
+    """Predictions for the stacks of each of fewer ranges, from where the stacks of the fine ones lie in them.
 
+    In a fine range a curve is a parabola through its two ends and its middle, so that the mean of the stacks'
+    binary fractions and the mean of their squares give its mean.
+    """
+    n = fine.count
+    n_fine = n.shape[-1]
+    uniform = run.config.binary_fraction == "uniform"
+    fraction = np.arange(2 * n_fine + 1) / (2 * n_fine) if uniform else fine.fraction[n > 0][:1]
+    curves = predicted_curves(run.population, run.config, run.config.n_stars, fraction, integrals)
+    place = fine.fraction * n_fine - np.arange(n_fine)  # 0 to 1 in the range
+    place2 = place**2 + fine.fraction_m2 / np.maximum(n, 1) * n_fine**2
 
-def _average(bias: FloatArray, sd: FloatArray) -> dict[str, float]:
-    variance = np.mean(sd**2)
+    def average(curve: FloatArray) -> FloatArray:
+        if uniform:
+            low, middle, high = curve[..., :-1:2], curve[..., 1::2], curve[..., 2::2]
+            slope, bend = 4 * middle - 3 * low - high, 2 * (low - 2 * middle + high)
+            curve = low + slope * place + bend * place2
+        total = np.where(n > 0, n * curve, 0.0).reshape(*n.shape[:2], bins, -1).sum(axis=-1)
+        count = n.reshape(*n.shape[:2], bins, -1).sum(axis=-1)
+        out: FloatArray = np.full_like(total, np.nan)
+        np.divide(total, count, out=out, where=count >= 2)
+        return out
+
+    bias, sd = curves["bias"].to_numpy(), curves["sd"].to_numpy()
+    mean, square, variance = average(bias), average(bias**2), average(sd**2)
     return {
-        "prediction_bias": bias.mean(),
-        "prediction_sigma": np.sqrt(variance + np.mean(bias**2)),
-        "prediction_sd": np.sqrt(variance + bias.var()),
+        "prediction_bias": mean,
+        "prediction_sigma": np.sqrt(variance + square),
+        "prediction_sd": np.sqrt(variance + np.maximum(square - mean**2, 0.0)),
     }

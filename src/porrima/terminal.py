@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
+from datetime import timedelta
 from typing import Any
 
 from rich import box, progress
@@ -14,24 +16,61 @@ from rich.text import Text
 
 __all__ = ["Progress", "show"]
 
+_QUIET = 10.0  # s between two lines where there is no terminal, at least
+_STEP = 0.01  # share of the whole between them, at least
+
 
 class Progress:
-    """A bar on standard error, with the rate and the time left."""
+    """A bar on standard error with the rate and the time left; where that is no terminal, a line now and then.
 
-    def __init__(self, total: int, unit: str) -> None:
+    Parameters
+    ----------
+    total : int
+        How many there are in all (count).
+    unit : str
+        Of what.
+    rate : (str, int), optional
+        Unit of the rate and how many there are in one of `unit`, such as 40 stars in a stack.
+    """
+
+    def __init__(self, total: int, unit: str, rate: tuple[str, int] | None = None) -> None:
+        self._total, self._unit, self._rate = total, unit, rate or (unit, 1)
+        self._done = self._before = self._told = 0
+        self._start = self._told_at = 0.0
         self._bar = progress.Progress(
             progress.BarColumn(),
             progress.MofNCompleteColumn(),
-            progress.TextColumn(unit),
-            progress.TimeRemainingColumn(),
+            progress.TextColumn("{task.description}"),
             console=Console(stderr=True),
         )
         self._task = self._bar.add_task(unit, total=total)
 
     def advance(self, n: int) -> None:
-        """Count n more as done; the bar is there from the first call on, so that an error comes before it."""
-        self._bar.start()
-        self._bar.update(self._task, advance=n)
+        """Count n more as done; the first are those that were there before, and the clock starts with them."""
+        now = time.monotonic()
+        self._done += n
+        if not self._start:
+            self._before, self._start, self._told_at = n, now, now
+        if sys.stderr.isatty():
+            self._bar.start()
+            self._bar.update(self._task, completed=self._done, description=self._words(now))
+        elif self._due(now):
+            self._told, self._told_at = self._done, now
+            print(f"{self._done} of {self._total} {self._words(now)}", file=sys.stderr, flush=True)
+
+    def _due(self, now: float) -> bool:
+        """Whether it is time for a line; what began to tell also tells its end."""
+        if self._done >= self._total:
+            return self._told > 0
+        return now - self._told_at >= _QUIET and self._done - self._told >= _STEP * self._total
+
+    def _words(self, now: float) -> str:
+        new, elapsed = self._done - self._before, now - self._start
+        if new <= 0 or elapsed <= 0:
+            return self._unit
+        left = (self._total - self._done) * elapsed / new
+        unit, each = self._rate
+        return f"{self._unit}, {_short(new * each / elapsed)} {unit}/s, {timedelta(seconds=round(left))} left"
 
     def __enter__(self) -> Progress:
         return self
@@ -39,6 +78,14 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         if self._bar.live.is_started:
             self._bar.stop()
+
+
+def _short(value: float) -> str:
+    """A rate with three figures: 81.2 million, 3.4."""
+    for size, name in ((1e9, " thousand million"), (1e6, " million"), (1e3, " thousand")):
+        if value >= size:
+            return f"{value / size:.3g}{name}"
+    return f"{value:.3g}"
 
 
 def show(
