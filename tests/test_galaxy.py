@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from porrima import figures
+from porrima import star_figures as figures
 from porrima.dust import WAVELENGTHS, Place, extinction_ratio
 from porrima.experiments import galaxy_against_catalog, population
 from porrima.galaxy import Robin2003

@@ -89,9 +89,9 @@ def stars(
     """Stars of the analytic Galaxy, of a real catalogue or of Gaia's archive, selected and counted."""
     from porrima.answers import COUNT_COLUMNS, count_lines, gaia_cone, population_config, stars_answer
     from porrima.catalogs import write_stars
-    from porrima.figures import selection
     from porrima.io import write_figure
     from porrima.sample import catalog_of, draw_stars
+    from porrima.star_figures import selection
 
     with gaia_cone(gaia, l, b, radius, mag, save, catalog) as cone:
         if cone is not None:
@@ -202,6 +202,9 @@ def simulate(
     method: Annotated[
         Literal["moments", "images"], typer.Option(help="Moments, or GalSim images.")
     ] = "moments",
+    device: Annotated[
+        Literal["cpu", "cuda"], typer.Option(help="Where to draw: the processor or a GPU.")
+    ] = "cpu",
     workers: Annotated[int | None, typer.Option(help="Processes of a local Dask cluster.", min=1)] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a Dask scheduler.")] = None,
     chunk: Annotated[
@@ -231,8 +234,8 @@ def simulate(
     start = time.perf_counter()
     with Progress(run.n_stacks, "stacks", ("stars", run.n_stars)) as progress:
         done = simulated(
-            run, output, resume=resume, method=method, chunk=chunk, workers=workers, scheduler=scheduler,
-            progress=progress.advance,
+            run, output, resume=resume, method=method, device=device, chunk=chunk, workers=workers,
+            scheduler=scheduler, progress=progress.advance,
         )  # fmt: skip
     wall = time.perf_counter() - start
     result = {
@@ -280,24 +283,37 @@ def paper(
     seed: Seed = 1,
     as_json: Json = False,
 ) -> None:
-    """The paper's figure of errors and biases against binary fraction, with its numbers."""
+    """The paper's figures of errors and biases, and of the number of stars in a stack, with their numbers."""
     from porrima.answers import NUMBER_COLUMNS, number_lines
-    from porrima.experiments import errors_and_biases, paper_config
+    from porrima.experiments import (
+        effect_of_n_stars,
+        errors_and_biases,
+        n_stars_configs,
+        paper_config,
+        store_name,
+    )
     from porrima.files import make_folder
+    from porrima.machine import peak_memory
     from porrima.report import write_report
     from porrima.summary import rows
 
-    config = paper_config(full=full, seed=seed)
+    config, others = paper_config(full=full, seed=seed), n_stars_configs(full=full, seed=seed)
     make_folder(output)
     start = time.perf_counter()
-    with Progress(config.n_stacks, "stacks", ("stars", config.n_stars)) as progress:
-        numbers = errors_and_biases(config, output / f"run-{config.n_stacks}-{seed}.zarr", progress.advance)
-    report = write_report(numbers, output)
+    n_drawn = sum(c.n_stacks * c.n_stars for c in (config, *others))
+    with Progress(n_drawn, "stars") as progress:
+        numbers = errors_and_biases(
+            config, output / store_name(config), lambda n: progress.advance(n * config.n_stars)
+        )
+        of_n_stars = effect_of_n_stars(others, output, progress.advance)
+    report = write_report(numbers, of_n_stars, output)
     result = {
         "report": str(report),
         "n_stacks": config.n_stacks,
         "n_stars": config.n_stars,
+        "n_stars_drawn": n_drawn,
         "wall_s": time.perf_counter() - start,
+        "peak_memory_mb": peak_memory(),
     }
     near = [row for row in rows(numbers.summary) if row["f_lo"] <= 0.35 < row["f_hi"]]
     show(result, as_json, f"report: {report}", NUMBER_COLUMNS, number_lines(near))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,9 +28,17 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["ErrorsAndBiases", "errors_and_biases", "galaxy_against_catalog", "paper_config", "population"]
+__all__ = [
+    "EffectOfNStars", "ErrorsAndBiases", "effect_of_n_stars", "errors_and_biases", "galaxy_against_catalog",
+    "n_stars_configs", "paper_config", "population", "store_name",
+]  # fmt: skip
 
 QUICK, FULL = 100_000, 500_000  # stacks; the paper has "hundreds of thousands"
+N_STARS = (40, 750, 2100, 10_000)
+"""Stars in the stacks of KCM16 Fig. 5 (count)."""
+
+N_STARS_QUICK, N_STARS_FULL = 10_000, 100_000  # stacks of each
+N_STARS_PSF = ("psf1", "psf2")
 GAP_RULES = {name: DucheneKraus2013(gap_rule=name) for name in ("lower", "solar")}
 MASS_CLASSES = {
     "below 0.1": (0.0, 0.1),
@@ -130,6 +139,106 @@ def errors_and_biases(
         mean_x=float(moments.mean_x[0]),
         removed_fraction=float(moments.removed_fraction[0]),
     )
+
+
+def store_name(config: RunConfig) -> str:
+    """Name of the folder that keeps the stacks of an experiment.
+
+    Parameters
+    ----------
+    config : RunConfig
+        The run.
+
+    Returns
+    -------
+    name : str
+        Another for another number of stars or stacks, or seed.
+    """
+    return f"run-{config.n_stars}-{config.n_stacks}-{config.seed}.zarr"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EffectOfNStars:
+    """Numbers of the figure of the number of stars in a stack.
+
+    Parameters
+    ----------
+    numbers : Dataset
+        As `summary.summarise` gives them, over n_stars besides, dimensionless.
+    limit : Dataset
+        Predicted against binary fraction for N → ∞, dimensionless.
+    """
+
+    numbers: xr.Dataset
+    limit: xr.Dataset
+
+
+def n_stars_configs(*, full: bool = False, seed: int = 1) -> list[RunConfig]:
+    """The settings of KCM16 Fig. 5.
+
+    Parameters
+    ----------
+    full : bool
+        At the paper's own number of stacks: 100 000 of each number of stars, 1.3e9 stars behind two PSFs.
+    seed : int
+        Of the runs.
+
+    Returns
+    -------
+    configs : list of RunConfig
+        As `paper_config`, one for each of `N_STARS`, behind PSF1 and PSF2.
+
+    References
+    ----------
+    KCM16
+    """
+    n_stacks = N_STARS_FULL if full else N_STARS_QUICK
+    common = {"psf": N_STARS_PSF, "n_stacks": n_stacks}
+    base = paper_config(full=full, seed=seed)
+    return [base.model_copy(update=common | {"n_stars": n_stars}) for n_stars in N_STARS]
+
+
+def effect_of_n_stars(
+    configs: list[RunConfig], folder: Path, progress: Callable[[int], None] = lambda _: None
+) -> EffectOfNStars:
+    """Error of the PSF's ellipticity against binary fraction for stacks of few and many stars (KCM16, Fig. 5).
+
+    Parameters
+    ----------
+    configs : list of RunConfig
+        From `n_stars_configs`.
+    folder : Path
+        Where the stacks are kept; those of an earlier call are used again.
+    progress : callable
+        Called with the number of stars done (count).
+
+    Returns
+    -------
+    numbers : EffectOfNStars
+        All that the figure shows.
+
+    Notes
+    -----
+    One set of stacks stands behind both PSFs, so that their errors are compared on the same stars.
+    """
+    import xarray as xr  # noqa: PLC0415  (slow to import, needed for results only)
+
+    summaries, integrals = [], None
+    for config in configs:
+        store = folder / store_name(config)
+        simulate(config, store, resume=store.exists(), progress=partial(_in_stars, progress, config.n_stars))
+        run = open_run(store)
+        integrals = integrals or integrate(run.population)
+        summaries.append(summarise(run, integrals=integrals))
+    numbers = xr.concat(summaries, dim="n_stars").assign_coords(n_stars=[c.n_stars for c in configs])
+    numbers.attrs["n_stacks"] = configs[0].n_stacks
+    return EffectOfNStars(
+        numbers=numbers, limit=predicted_curves(run.population, configs[0], None, integrals=integrals)
+    )
+
+
+def _in_stars(progress: Callable[[int], None], n_stars: int, n_stacks: int) -> None:
+    progress(n_stacks * n_stars)
 
 
 def population(

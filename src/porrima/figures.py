@@ -7,17 +7,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator, StrMethodFormatter
+from matplotlib.ticker import LogLocator
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from porrima.instruments import Requirement
-    from porrima.stars import Stars
 
-__all__ = ["errors_and_biases", "galaxy_against_catalog", "population", "responses", "selection", "toy_maps"]
+__all__ = [
+    "COLOURS",
+    "MARKERS",
+    "STYLE",
+    "effect_of_n_stars",
+    "errors_and_biases",
+    "performance",
+    "responses",
+    "toy_maps",
+]
 
-_COLOURS = (
+COLOURS = (
     "#0072b2",
     "#d55e00",
     "#009e73",
@@ -25,13 +33,13 @@ _COLOURS = (
     "#e69f00",
     "#56b4e9",
 )  # Okabe & Ito, safe for all eyes
-_MARKERS = ("o", "s", "^", "D", "v", "P")
+MARKERS = ("o", "s", "^", "D", "v", "P")
 _PANELS = (
     ("r2", r"$\sigma(R^2)/R_0^2$", r"$\langle\delta R^2\rangle/R_0^2$"),
     ("e1", r"$\sigma(e_1)$", r"$\langle\delta e_1\rangle$"),
     ("e2", r"$\sigma(e_2)$", r"$\langle\delta e_2\rangle$"),
 )
-_STYLE = {
+STYLE = {
     "font.size": 9.0,
     "axes.linewidth": 0.8,
     "xtick.direction": "in",
@@ -63,7 +71,7 @@ def errors_and_biases(
     figure : Figure
         Ready to be written.
     """
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(7.4, 8.4), layout="constrained")
         axes = figure.subplots(3, 2, sharex=True)
         for row, (quantity, error_label, bias_label) in zip(axes, _PANELS, strict=True):
@@ -89,13 +97,13 @@ def _panel(
     n_psf = summary.sizes["psf"]
     for p, psf in enumerate(summary["psf"].to_numpy()):
         here = {"psf": psf, "quantity": quantity}
-        colour = _COLOURS[p % len(_COLOURS)]
+        colour = COLOURS[p % len(COLOURS)]
         shift = 0.5 * half * (p - 0.5 * (n_psf - 1)) / max(n_psf, 1)  # apart, to be told from each other
         axis.errorbar(
             centre + shift,
             summary[statistic].sel(here),
             yerr=summary[f"{statistic}_se"].sel(here),
-            color=colour, marker=_MARKERS[p % len(_MARKERS)], markersize=3.2, linestyle="none", linewidth=0.9,
+            color=colour, marker=MARKERS[p % len(MARKERS)], markersize=3.2, linestyle="none", linewidth=0.9,
             label=str(psf).upper(),
         )  # fmt: skip
         fraction = curves["binary_fraction"]
@@ -119,168 +127,79 @@ def _legend(figure: Figure, axis: Any, curves: xr.Dataset, requirement: Requirem
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=8.5)
 
 
-_SHARES = (
-    ("0.1-0.5", _COLOURS[1], "0.1–0.5"),
-    ("0.5-1.5", _COLOURS[0], "0.5–1.5"),
-    ("0.5-0.7", _COLOURS[5], "0.5–0.7"),
-    ("0.7-1.5", _COLOURS[2], "0.7–1.5"),
-    ("below 0.1", _COLOURS[3], "below 0.1"),
-)
-_SCANS = (
-    ("l = 0", "$l = 0°$", "Galactic latitude $b$ [deg]"),
-    ("l = 180", "$l = 180°$", "Galactic latitude $b$ [deg]"),
-    ("b = 45", "$b = 45°$", "Galactic longitude $l$ [deg]"),
-)
-
-
-def selection(stars: Stars) -> Figure:
-    """Three panels: how the stars of a selection are distributed in magnitude, mass and distance, by component.
+def effect_of_n_stars(numbers: xr.Dataset, limit: xr.Dataset, requirement: Requirement) -> Figure:
+    """Two panels: error of e1 and e2 against binary fraction, for stacks of few and many stars (KCM16, Fig. 5).
 
     Parameters
     ----------
-    stars : Stars
-        The selection: mag, M_sun, pc.
+    numbers : Dataset
+        ``sigma``, ``sigma_se`` and ``prediction_sigma`` over (n_stars, psf, quantity, bin), dimensionless: symbols
+        with their standard errors, and solid lines.
+    limit : Dataset
+        From `summary.predicted_curves` for infinitely many stars: dashed lines.
+    requirement : Requirement
+        Drawn as dotted lines.
 
     Returns
     -------
     figure : Figure
         Ready to be written.
     """
-    groups = {
-        "thin disc": "thin",
-        "thick disc": "thick",
-        "halo": "halo",
-        "bulge": "bulge",
-        "component unknown": "unknown",
-    }
-    names = [n for n, start in groups.items() if np.any(np.char.startswith(stars.component, start))]
-    masks = [np.char.startswith(stars.component, groups[name]) for name in names]
-    with rc_context(_STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(8.6, 3.1), layout="constrained")
-        axes = figure.subplots(1, 3)
-        per = f" per deg² ({stars.area:g} deg²)" if stars.area else ""
-        for axis, values, label, scale in (
-            (axes[0], stars.magnitude, f"{stars.band} [mag]", "linear"),
-            (axes[1], stars.mass, r"mass [M$_\odot$]", "log"),
-            (axes[2], stars.distance, "distance [pc]", "log"),
-        ):
-            space = np.geomspace if scale == "log" else np.linspace
-            edges = space(values.min(), values.max() * (1 + 1e-9), 31)
-            weights = [np.full(int(m.sum()), 1 / stars.area if stars.area else 1.0) for m in masks]
-            axis.hist([values[m] for m in masks], edges, weights=weights, stacked=True, label=names,
-                      color=_COLOURS[: len(names)])  # fmt: skip
-            axis.set_xscale(scale)
-            axis.set_xlabel(label)
-        axes[0].set_ylabel("stars in each bin" + per)
-        axes[1].xaxis.set_major_locator(FixedLocator([0.1, 0.2, 0.5, 1.0]))
-        axes[1].xaxis.set_major_formatter("{x:g}")
-        axes[1].xaxis.set_minor_locator(NullLocator())
-        axes[2].legend(frameon=False, fontsize=8)
-        figure.suptitle(f"{len(stars)} main-sequence stars, {stars.source}", fontsize=9)
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(7.4, 4.6), layout="constrained")
+        axes = figure.subplots(1, 2, sharex=True, sharey=True)
+        for axis, quantity in zip(axes, ("e1", "e2"), strict=True):
+            centre = 0.5 * (numbers["f_lo"] + numbers["f_hi"])
+            for p, psf in enumerate(numbers["psf"].to_numpy()):
+                filled = {"markerfacecolor": "none"} if p % 2 else {}
+                for n, n_stars in enumerate(numbers["n_stars"].to_numpy()):
+                    here = numbers.sel(n_stars=n_stars, psf=psf, quantity=quantity)
+                    colour = COLOURS[n % len(COLOURS)]
+                    label = f"{n_stars} stars" if p == 0 else None
+                    axis.errorbar(
+                        centre, here["sigma"], yerr=here["sigma_se"], color=colour, marker=MARKERS[p % len(MARKERS)],
+                        markersize=3.6, linestyle="none", linewidth=0.9, label=label, **filled,
+                    )  # fmt: skip
+                    axis.plot(centre, here["prediction_sigma"], color=colour, linewidth=1.0)
+                endless = limit["sigma"].sel(psf=psf, quantity=quantity)
+                axis.plot(
+                    limit["binary_fraction"],
+                    endless,
+                    color="0.25",
+                    linewidth=0.9,
+                    linestyle=("--", "-.")[p % 2],
+                )
+            axis.axhline(requirement.sigma_e, color="#b00020", linestyle=":", linewidth=1.2)
+            axis.set_yscale("log")
+            axis.set_ylim(1e-6, 4e-3)
+            axis.set_xlim(0.0, 1.0)
+            axis.set_xlabel("binary fraction of the population")
+            axis.set_title(f"$e_{quantity[1]}$", fontsize=9.5)
+        axes[0].set_ylabel(r"$\sigma(e_i)$")
+        _legend_of_n_stars(figure, axes[0], numbers, requirement)
     return figure
 
 
-def population(dataset: xr.Dataset) -> Figure:
-    """Share of mass classes, and mean binary fraction, against latitude and longitude (KCM16 Sect. 4.3).
-
-    Parameters
-    ----------
-    dataset : Dataset
-        From `experiments.population`, dimensionless against angles in deg.
-
-    Returns
-    -------
-    figure : Figure
-        Ready to be written.
-    """
-    with rc_context(_STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(7.4, 5.4), layout="constrained")
-        axes = figure.subplots(2, 3, sharex="col", sharey="row")
-        for column, (scan, title, label) in zip(axes.T, _SCANS, strict=True):
-            here = dataset.sel(scan=scan).dropna("angle", subset=["n_per_deg2"])
-            angle = here["angle"]
-            for name, colour, words in _SHARES:
-                share = here["share"].sel(mass_class=name)
-                style = "-" if name in ("0.1-0.5", "0.5-1.5", "below 0.1") else "--"
-                column[0].plot(angle, share, style, color=colour, linewidth=1.3, label=words)
-            column[1].axhspan(0.35, 0.40, color="0.9", linewidth=0.0, label="KCM16, mean")
-            for rule, style in (("solar", "-"), ("lower", "--")):
-                fraction = here["binary_fraction"].sel(gap_rule=rule)
-                column[1].plot(angle, fraction, style, color="0.2", linewidth=1.3, label=f"gaps: {rule} row")
-            column[0].set_title(title, fontsize=9.5)
-            column[1].set_xlabel(label)
-            column[1].set_xlim(float(angle[0]), float(angle[-1]))
-            column[1].set_xticks(range(15, 76, 15) if scan != "b = 45" else range(0, 361, 90))
-        axes[0, 0].set_ylim(0.0, 0.8)
-        axes[0, 0].set_ylabel("share of the stars")
-        axes[1, 0].set_ylim(0.2, 0.42)
-        axes[1, 0].set_ylabel("mean binary fraction")
-        lo, hi = dataset.attrs["magnitude_lo"], dataset.attrs["magnitude_hi"]
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        title = rf"mass [M$_\odot$], main sequence, ${lo:g} \leq {dataset.attrs['band']} < {hi:g}$"
-        figure.legend(
-            handles, labels, title=title, loc="outside upper center", ncols=5, frameon=False, fontsize=8.5
-        )
-        axes[1, 1].legend(loc="lower right", frameon=False, fontsize=8.0)
-    return figure
-
-
-_BESIDE = (
-    ("counts", "stars per deg² and mag"),
-    ("median_distance", "median distance [pc]"),
-    ("mean_mass", r"mean mass [M$_\odot$]"),
-    ("fraction", "mean multiplicity fraction"),
-)
-
-
-def galaxy_against_catalog(datasets: list[xr.Dataset]) -> Figure:
-    """Counts, distances, masses and multiplicity of the analytic Galaxy beside catalogues.
-
-    Parameters
-    ----------
-    datasets : list of Dataset
-        One column of panels each, from `experiments.galaxy_against_catalog`: per deg² and mag, pc, M_sun.
-
-    Returns
-    -------
-    figure : Figure
-        Ready to be written.
-    """
-    with rc_context(_STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(7.4, 9.0), layout="constrained")
-        axes = figure.subplots(len(_BESIDE), len(datasets), sharex=True, sharey="row", squeeze=False)
-        for column, data in zip(axes.T, datasets, strict=True):
-            for axis, (quantity, _) in zip(column, _BESIDE, strict=True):
-                if quantity == "fraction":
-                    _beside(axis, data, "fraction_solar", 0, "gaps: solar row")
-                    _beside(axis, data, "fraction_lower", 1, "gaps: lower row")
-                    axis.legend(frameon=False, fontsize=7.5)
-                else:
-                    _beside(axis, data, quantity, 0, "Besançon catalogue")
-            column[0].set_title(f"$l = {data.attrs['l']:g}°$, $b = {data.attrs['b']:g}°$", fontsize=9.5)
-            column[-1].set_xlabel(f"${data.attrs['band']}$ [mag]")
-        for axis, (quantity, label) in zip(axes[:, 0], _BESIDE, strict=True):
-            axis.set_ylabel(label)
-            if quantity in ("counts", "median_distance"):
-                axis.set_yscale("log")
-                axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-                axis.yaxis.set_major_formatter(StrMethodFormatter("{x:.0f}"))
-                axis.yaxis.set_minor_formatter(NullFormatter())
-        axes[0, 0].plot([], [], color=_COLOURS[0], linewidth=1.3, label="analytic Galaxy")
-        axes[0, 0].legend(frameon=False, fontsize=7.5)
-    return figure
-
-
-def _beside(axis: Any, data: xr.Dataset, quantity: str, number: int, label: str) -> None:
-    """The model as a staircase, the catalogue as points with their sampling errors."""
-    here = data.sel(quantity=quantity)
-    edges = [*data["mag_lo"].to_numpy(), float(data["mag_hi"][-1])]
-    axis.stairs(here["galaxy"], edges, color=_COLOURS[number], linewidth=1.3, baseline=None)
-    axis.errorbar(
-        0.5 * (data["mag_lo"] + data["mag_hi"]), here["catalog"], yerr=here["stderr"],
-        color=_COLOURS[number], marker=_MARKERS[number], markersize=3.6, linestyle="none", linewidth=0.9,
-        label=label,
-    )  # fmt: skip
+def _legend_of_n_stars(figure: Figure, axis: Any, numbers: xr.Dataset, requirement: Requirement) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    for p, psf in enumerate(numbers["psf"].to_numpy()):
+        name = str(psf).upper()
+        face = "none" if p % 2 else "0.25"
+        style = {
+            "color": "0.25",
+            "marker": MARKERS[p % len(MARKERS)],
+            "markersize": 3.6,
+            "markerfacecolor": face,
+        }
+        handles += axis.plot([], [], linestyle="none", **style)
+        labels.append(name)
+        handles += axis.plot([], [], color="0.25", linewidth=0.9, linestyle=("--", "-.")[p % 2])
+        labels.append(f"{name}, infinitely many")
+    handles += axis.plot([], [], color="0.25", linewidth=1.0)
+    labels.append("prediction")
+    handles += axis.plot([], [], color="#b00020", linestyle=":", linewidth=1.2)
+    labels.append(f"requirement ({requirement.name})")
+    figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=8.0)
 
 
 _TOY_ROWS = (
@@ -306,7 +225,7 @@ def toy_maps(maps: xr.Dataset) -> Figure:
     from matplotlib.colors import Normalize, SymLogNorm  # noqa: PLC0415
 
     columns = [(p, m) for p in range(maps.sizes["psf"]) for m in range(maps.sizes["delta_m"])]
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(1.95 * len(columns) + 1.2, 6.3), layout="constrained")
         axes = figure.subplots(3, len(columns), sharex=True, sharey=True, squeeze=False)
         for row, (name, label, colours, levels) in zip(axes, _TOY_ROWS, strict=True):
@@ -359,7 +278,7 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
     groups = list(dict.fromkeys(row["group"] for row in rows))
     estimators = list(dict.fromkeys(row["kind"] for row in rows))
     mixed = {g for g in groups if len({row["kind"] for row in rows if row["group"] == g}) > 1}
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(max(4.5, 0.42 * len(groups) + 1.4), 6.2), layout="constrained")
         axes = figure.subplots(2, 1, sharex=True)
         for name, axis, label in (
@@ -372,7 +291,7 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
                 axis.plot(
                     [groups.index(r["group"]) + (shift if r["group"] in mixed else 0.0) for r in here],
                     [r[name] for r in here],
-                    linestyle="none", marker=_MARKERS[k], color=_COLOURS[k], markersize=4.0, alpha=0.8, label=estimator,
+                    linestyle="none", marker=MARKERS[k], color=COLOURS[k], markersize=4.0, alpha=0.8, label=estimator,
                 )  # fmt: skip
             axis.axhline(1.0, color="0.35", linewidth=0.9, zorder=0)
             axis.set_ylabel(label)
@@ -390,12 +309,12 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
 
 
 _SPEEDS = (
-    ("moments", "engine, moments", _COLOURS[0], "o"),
-    ("shapes", "engine, with shapes", _COLOURS[5], "D"),
+    ("moments", "engine, moments", COLOURS[0], "o"),
+    ("shapes", "engine, with shapes", COLOURS[5], "D"),
     ("floor", "random numbers alone", "0.45", "|"),
-    ("fft", "numpy, histogram and FFT", _COLOURS[2], "^"),
-    ("galsim-sum", "GalSim, one draw per stack", _COLOURS[4], "s"),
-    ("galsim-stars", "GalSim, star by star", _COLOURS[1], "v"),
+    ("fft", "numpy, histogram and FFT", COLOURS[2], "^"),
+    ("galsim-sum", "GalSim, one draw per stack", COLOURS[4], "s"),
+    ("galsim-stars", "GalSim, star by star", COLOURS[1], "v"),
 )
 _COSTS = (("us_per_stack", 0), ("us_per_stack_with_shape", 1))  # against the first two of _SPEEDS
 
@@ -413,7 +332,7 @@ def performance(result: dict[str, Any]) -> Figure:
     figure : Figure
         Three panels, all on logarithmic axes.
     """
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(9.6, 3.9), layout="constrained")
         axes = figure.subplots(1, 3, width_ratios=(1.4, 1.0, 1.0))
         _speeds(axes[0], result["speeds"])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from porrima import __version__
-from porrima.figures import errors_and_biases
+from porrima.figures import effect_of_n_stars, errors_and_biases
 from porrima.files import write_whole
 from porrima.instruments import KCM16
 from porrima.io import write_figure, write_rows
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
 
-    from porrima.experiments import ErrorsAndBiases
+    from porrima.experiments import EffectOfNStars, ErrorsAndBiases
 
 __all__ = ["write_report"]
 
@@ -57,7 +57,17 @@ the stacks, and so their scatter. Dotted: requirement of {requirement}.</figcapt
 <h2>Simulation against prediction</h2>
 <p>{agreement}</p>
 <div class="wide">{table}</div>
-<p>The whole table is in <code>errors_and_biases.ecsv</code>, the stacks in the Zarr store beside it.</p>
+<h2>Number of stars in a stack</h2>
+<figure>
+{second_figure}
+<figcaption>Error of the two ellipticity components of stacks of {n_stars_list} stars, after Kuntzer, Courbin &amp;
+Meylan (2016), Fig. 5. Symbols: {n_stacks_each} simulated stacks of each, with standard errors; one set of stacks stands
+behind both PSFs. Solid: closed form. Dashed: closed form for infinitely many stars, the bias that no number of stars
+takes away. Dotted: requirement.</figcaption>
+</figure>
+<p>{second_agreement}</p>
+<p>The whole tables are in <code>errors_and_biases.ecsv</code> and <code>effect_of_n_stars.ecsv</code>, the stacks in
+the Zarr stores beside them.</p>
 <h2>How it was made</h2>
 <p>Stars: {stars}. {pairs}</p>
 <pre>{config}</pre>
@@ -69,13 +79,15 @@ Robin et al. 2003; Bressan et al. 2012.</p>
 """
 
 
-def write_report(numbers: ErrorsAndBiases, folder: Path) -> Path:
-    """Path of the page written, with the figure (SVG, PDF, PNG) and the table (ECSV) beside it.
+def write_report(numbers: ErrorsAndBiases, of_n_stars: EffectOfNStars, folder: Path) -> Path:
+    """Path of the page written, with the figures (SVG, PDF, PNG) and the tables (ECSV) beside it.
 
     Parameters
     ----------
     numbers : ErrorsAndBiases
         From `experiments.errors_and_biases`.
+    of_n_stars : EffectOfNStars
+        From `experiments.effect_of_n_stars`.
     folder : Path
         Where to write; it exists.
 
@@ -84,19 +96,35 @@ def write_report(numbers: ErrorsAndBiases, folder: Path) -> Path:
     page : Path
         ``index.html`` in the folder.
     """
-    figure = errors_and_biases(numbers.summary, numbers.curves, numbers.limit, KCM16)
-    for suffix in ("svg", "pdf", "png"):
-        write_figure(figure, folder / f"errors_and_biases.{suffix}")
+    figures = {
+        "errors_and_biases": errors_and_biases(numbers.summary, numbers.curves, numbers.limit, KCM16),
+        "effect_of_n_stars": effect_of_n_stars(of_n_stars.numbers, of_n_stars.limit, KCM16),
+    }
+    for name, figure in figures.items():
+        for suffix in ("svg", "pdf", "png"):
+            write_figure(figure, folder / f"{name}.{suffix}")
     write_rows(rows(numbers.summary), folder / "errors_and_biases.ecsv")
+    by_n_stars = [
+        {"n_stars": int(n)} | row
+        for n in of_n_stars.numbers["n_stars"].to_numpy()
+        for row in rows(of_n_stars.numbers.sel(n_stars=n))
+    ]
+    write_rows(by_n_stars, folder / "effect_of_n_stars.ecsv")
     page = folder / "index.html"
-    write_whole(page, lambda path: path.write_text(_page(numbers, figure), encoding="utf-8"))
+    text = _page(numbers, of_n_stars.numbers, *figures.values())
+    write_whole(page, lambda path: path.write_text(text, encoding="utf-8"))
     return page
 
 
-def _page(numbers: ErrorsAndBiases, figure: Figure) -> str:
+def _svg(figure: Figure) -> str:
+    """A figure as it stands in a page."""
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()[text.getvalue().index("<svg") :]
+
+
+def _page(numbers: ErrorsAndBiases, of_n_stars: xr.Dataset, figure: Figure, second_figure: Figure) -> str:
     config = numbers.config
-    svg = io.StringIO()
-    figure.savefig(svg, format="svg", metadata={"Date": None})
     where = config.stars
     stars = (
         f"l = {where.l:g}°, b = {where.b:g}° of the analytic Galaxy"
@@ -105,7 +133,11 @@ def _page(numbers: ErrorsAndBiases, figure: Figure) -> str:
     )
     return _PAGE.format(
         answer=_answer(numbers),
-        figure=svg.getvalue()[svg.getvalue().index("<svg") :],
+        figure=_svg(figure),
+        second_figure=_svg(second_figure),
+        n_stars_list=", ".join(str(n) for n in of_n_stars["n_stars"].to_numpy()),
+        n_stacks_each=f"{of_n_stars.attrs['n_stacks']:,}".replace(",", " "),
+        second_agreement=_agreement(of_n_stars),
         n_stars=config.n_stars,
         n_stacks=f"{config.n_stacks:,}".replace(",", " "),
         mag=f"{where.mag[0]:g} to {where.mag[1]:g}",
@@ -145,7 +177,7 @@ def _agreement(summary: xr.Dataset) -> str:
     }
     checked = int(np.isfinite(summary["bias"]).sum()) * len(pulls)
     worst = ", ".join(f"{name} {pull:.1f}" for name, pull in pulls.items())
-    failed = float((summary["n_failed"].sum("bin") / summary["n_stacks"].sum()).max())
+    failed = float((summary["n_failed"].sum("bin") / summary["n_stacks"].sum("bin")).max())
     lost = f" {failed:.1%} of the stacks could not be measured and are left out." if failed > 0 else ""
     return f"Largest difference of {checked} numbers, in standard errors of the simulation: {worst}.{lost}"
 

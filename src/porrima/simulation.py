@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from porrima.cluster import Cluster
     from porrima.psf import PSF
     from porrima.shapes import Shape
+    from porrima.stack import Device, Stacks
     from porrima.systems import Population
 
     FloatArray = NDArray[np.float64]
@@ -49,6 +50,7 @@ def simulate(
     *,
     resume: bool = False,
     method: Method = "moments",
+    device: Device = "cpu",
     chunk: int | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -66,6 +68,8 @@ def simulate(
         Go on with a store of the same configuration; without it an existing path is refused.
     method : {"moments", "images"}
         Shapes from kernel moments through the response, or from images drawn and measured with GalSim.
+    device : {"cpu", "cuda"}
+        Where stacks are drawn; their bits, and so their stores, are those of one kind of device.
     chunk : int, optional
         Stacks per chunk (count), `CHUNK` where not given; a resumed run keeps that of its store.
     workers : int, optional
@@ -89,8 +93,10 @@ def simulate(
         If the run had to stop: the disk is full, or workers die.
     """
     check_output(path, resume)
-    run = _Run.of(config, population_of(config, draw_stars(config)), method)
+    run = _Run.of(config, population_of(config, draw_stars(config)), method, device)
     known = header(config, run.population.stars, run.alone, method=method, identity=run.identity)
+    if workers is None and scheduler is None:
+        run.draw(0, 0)  # refuses a device that is not there before a store is made
     layout = {"n_stacks": config.n_stacks, "chunk": chunk or CHUNK[method]}
     with cluster_of(workers, scheduler) as cluster, opened(path, known, **layout, resume=resume) as store:
         missing = store.missing()
@@ -108,27 +114,34 @@ class _Run:
     config: RunConfig
     population: Population
     method: Method
+    device: Device
     alone: FloatArray
 
     @classmethod
-    def of(cls, config: RunConfig, population: Population, method: Method) -> _Run:
+    def of(cls, config: RunConfig, population: Population, method: Method, device: Device) -> _Run:
         shapes = [_without_companions(config, name, method) for name in config.psf]
         alone = [[float(np.squeeze(getattr(shape, name))) for shape in shapes] for name in QUANTITIES]
-        return cls(config=config, population=population, method=method, alone=np.array(alone))
+        return cls(config=config, population=population, method=method, device=device, alone=np.array(alone))
 
-    def chunk(self, first: int, last: int) -> Chunk:
+    def draw(self, first: int, last: int) -> Stacks:
         config = self.config
         try:
-            stacks = draw_stacks(
+            return draw_stacks(
                 self.population,
                 n_stars=config.n_stars,
                 binary_fraction=config.binary_fraction,
                 seed=config.seed,
                 first=first,
                 last=last,
+                device=self.device,
             )
+        except InputError:
+            raise
         except ValueError as error:
             raise InputError(str(error)) from None
+
+    def chunk(self, first: int, last: int) -> Chunk:
+        config, stacks = self.config, self.draw(first, last)
         shapes = np.empty((3, len(config.psf), last - first))
         for p, name in enumerate(config.psf):
             shape = (
@@ -174,7 +187,7 @@ class _Run:
     def identity(self) -> str:
         """Hash of all that the numbers depend on."""
         rest = self.config.model_copy(update={"stars": None})  # wherever the stars came from, here they are
-        digest = hashlib.sha256(f"{canonical(rest)} {self.method} {__version__}".encode())
+        digest = hashlib.sha256(f"{canonical(rest)} {self.method} {self.device} {__version__}".encode())
         digest.update(self.population.stars.band.encode())
         for shape in self.alone.T:  # a file of a PSF's name may have changed
             digest.update(" ".join(f"{number:.9f}" for number in shape).encode())
