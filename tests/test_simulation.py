@@ -106,7 +106,7 @@ def test_workers_write_where_they_see_the_store_and_else_the_client_does(
 def test_a_worker_of_a_process_that_has_died_leaves_another_run_alone(finished, tmp_path):
     path = tmp_path / "run.zarr"
     shutil.copytree(finished, path)
-    run = simulation._Run.of(small(seed=4), open_run(path).population, "moments")
+    run = simulation._Run.of(small(seed=4), open_run(path).population, "moments", "cpu")
     with locked(path):
         result = simulation._write_there(run, path, "token of the dead", 0, 100)
     assert isinstance(result, Chunk)
