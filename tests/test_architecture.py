@@ -53,6 +53,9 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "pairs": {"elementary", "moments", "orbits", "streams"},
     "stack": {"moments", "pairs", "photometry", "streams", "systems"},
     "prediction": {"errors", "moments", "orbits", "photometry", "response", "systems"},
+    "galaxies": {"errors", "units"},
+    "shear": {"errors", "galaxies", "moments", "prediction", "shapes"},
+    "deconvolution": {"galaxies", "moments", "psf", "shear"},
     "config": {"errors", "multiplicity", "photometry"},
     "sample": {"catalogs", "config", "errors", "galaxy", "stars", "systems"},
     "simulation": {
@@ -74,6 +77,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
 }  # fmt: skip
 NEVER_REACHED = {  # followed through every module in between
     "prediction": {"stack", "simulation"},
+    "deconvolution": {"stack", "simulation"},
     "images": {"response", "weighted", "stack", "prediction"},
     "stack": {"prediction", "response", "psf"},
     "figures": {"prediction", "stack", "simulation", "summary"},
