@@ -19,8 +19,15 @@ from porrima.prediction import integrate, population_moments, predict
 from porrima.psf import psf_from_name
 from porrima.response import response
 from porrima.shapes import Adaptive
-from porrima.shear import deconvolution_bias, ellipticity_factors, moments_bias, naive_bias
-from porrima.stack import draw_systems
+from porrima.shear import (
+    deconvolution_bias,
+    ellipticity_factors,
+    gaussian_response,
+    moments_bias,
+    naive_bias,
+)
+from porrima.stack import draw_stacks, draw_systems
+from statistics_helpers import assert_within_sigma
 
 N, SCALE = 128, 0.03  # pixels of an image and their side: finer than the band limit of each PSF asks for
 FRACTION, SEED = 0.35, 20260701
@@ -170,7 +177,7 @@ def test_the_drawn_kernel_is_that_of_the_population(kernel, moments):
 
 @pytest.mark.parametrize(
     ("profile", "radius"),
-    [("Gaussian", 0.1), ("exponential", 0.1), ("exponential", 0.25), ("de Vaucouleurs", 0.25)],
+    [("Gaussian", 0.1), ("exponential", 0.1), ("exponential", 0.25), ("de Vaucouleurs", 0.1)],
 )
 @pytest.mark.parametrize("name", ["psf1", "psf2", "optical1"])
 def test_forward_fits(name, profile, radius, kernel, moments, record):
@@ -180,8 +187,8 @@ def test_forward_fits(name, profile, radius, kernel, moments, record):
     m, c = of_fits(name, PROFILES[profile], radius, kernel)
     expected = complex(predicted.c1[0], predicted.c2[0])
     record(
-        "24 Shear from forward fits: galaxies at four orientations (e = 0.4), fitted on drawn images with the PSF of a "
-        "million stars at 35 % binaries; kappa is m over the mean x over R²",
+        "24 Shear from forward fits: Galaxies at four orientations (e = 0.4), fitted on drawn images with the PSF of a "
+        "million stars at 35 % binaries; kappa is m over the mean x over R².",
         ["PSF", "profile", "half-light radius", "kappa", "m measured", "m predicted", "c1, c2 measured", "predicted"],
         [
             name, profile, f"{radius}″", f"{found.kappa_m:.3g}", f"{m:.3e}", f"{predicted.m[0]:.3e}",
@@ -197,12 +204,12 @@ def test_forward_fits(name, profile, radius, kernel, moments, record):
     [
         ("psf1", "Gaussian", 0.1, 0.03),
         ("psf1", "exponential", 0.1, 0.03),
-        ("psf1", "exponential", 0.2, 0.04),
-        ("psf1", "de Vaucouleurs", 0.1, 0.03),
+        ("psf1", "exponential", 0.2, 0.03),
+        ("psf1", "de Vaucouleurs", 0.1, 0.1),  # 1 % for round ones
         ("psf2", "exponential", 0.1, 0.03),
         ("optical1", "Gaussian", 0.1, 0.03),
         ("optical1", "exponential", 0.1, 0.03),
-        ("optical1", "exponential", 0.2, 0.2),  # REGAUSS itself is 10 % off there
+        ("optical1", "exponential", 0.2, 0.07),  # REGAUSS itself is 10 % off there
     ],
 )
 def test_regauss(name, profile, radius, rel, kernel, moments, record):
@@ -213,19 +220,47 @@ def test_regauss(name, profile, radius, rel, kernel, moments, record):
     m, c = of_regauss(name, PROFILES[profile], radius, kernel)
     expected, independent = (complex(b.c1[0], b.c2[0]) for b in (predicted, naive))
     record(
-        "25 Shear from REGAUSS: the same galaxies measured by HSM; the naive c takes the errors of the PSF's size and "
-        "ellipticity for independent",
-        ["PSF", "profile", "half-light radius", "m measured", "m predicted", "|c| measured", "predicted", "naive"],
+        "25 Shear from REGAUSS: The same galaxies measured by HSM; the naive c takes the errors of the PSF's size and "
+        "ellipticity for independent.",
+        ["PSF", "profile", "half-light radius", "m measured", "m predicted", "abs(c) measured", "predicted", "naive"],
         [
             name, profile, f"{radius}″", f"{m:.3e}", f"{predicted.m[0]:.3e}",
             f"{abs(c):.1e}", f"{abs(expected):.1e}", f"{abs(independent):.1e}",
         ],
     )  # fmt: skip
-    print(name, profile, radius, m / predicted.m[0], c, expected, independent)
     assert m == pytest.approx(predicted.m[0], rel=rel)
     assert abs(c - expected) < 3e-6
     if name.startswith("psf"):
         assert abs(independent) > 10 * abs(c)
+
+
+def test_scatter_between_patches(population, moments, record):
+    n_stars, n_patches, r2 = 750, 20_000, 0.05
+    drawn = draw_stacks(
+        population, n_stars=n_stars, binary_fraction=FRACTION, seed=SEED, first=0, last=n_patches
+    ).moments.values[:, :3]
+    # m of round galaxies; c of galaxies of e = 0.4 at four orientations, from what is left of their second moments
+    m = (drawn[:, 0] + drawn[:, 2]) / r2
+    g = reduced(np.sqrt(E2)) * 1j ** np.arange(4)
+    q = r2 / 2 / (1 - abs(g) ** 2) * np.array([abs(1 + g) ** 2, 2 * g.imag, abs(1 - g) ** 2])
+    xx, xy, yy = np.moveaxis(q - drawn[:, :, None], 1, 0)
+    c = np.mean(reduced((xx - yy + 2j * xy) / (xx + yy)), axis=-1)
+    predicted = deconvolution_bias(moments, gaussian_response(Galaxies.of(r2), "g"), n_stars)
+    assert_within_sigma(m.mean(), predicted.m[0], predicted.sd_m[0] / np.sqrt(n_patches))
+    for name, values, sd in (
+        ("m", m, predicted.sd_m[0]),
+        ("c1", c.real, predicted.sd_c1[0]),
+        ("c2", c.imag, predicted.sd_c2[0]),
+    ):
+        found, fourth = values.std(), np.mean((values - values.mean()) ** 4)
+        stderr = np.sqrt((fourth - found**4) / n_patches) / (2 * found)
+        record(
+            "27 Scatter of m and c between patches: 20 000 patches of 750 stars at 35 % binaries, second moments of "
+            "Gaussian galaxies with R² of 0.05 arcsec² and e = 0.4.",
+            ["quantity", "drawn", "predicted", "pull"],
+            [f"sd({name})", f"{found:.3e}", f"{sd:.3e}", f"{(found - sd) / stderr:.1f}"],
+        )
+        assert_within_sigma(found, sd, stderr)
 
 
 @pytest.mark.parametrize("method", [of_fits, of_regauss])
@@ -260,7 +295,7 @@ def test_how_ellipticities_become_a_shear_changes_m(kernel, record):
         ratio, expected = m_of(estimate) / of_g, ellipticity_factors(E2, name)[0]
         record(
             "26 Shear from ellipticities: m of the mean distortion over the responsivity, over that of the mean of g, "
-            "for Gaussian galaxies with e = 0.4",
+            "for Gaussian galaxies with e = 0.4.",
             ["responsivity", "measured", "formula"],
             [name, f"{ratio:.3f}", f"{expected:.3f}"],
         )
