@@ -52,7 +52,16 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     },
     "pairs": {"elementary", "moments", "orbits", "streams"},
     "stack": {"moments", "pairs", "photometry", "streams", "systems"},
-    "prediction": {"errors", "moments", "orbits", "photometry", "response", "systems"},
+    "integrals": {"moments", "orbits", "photometry", "systems"},
+    "averages": {"errors", "integrals", "moments", "systems"},
+    "singles": {"moments", "response"},
+    "prediction": {"averages", "integrals", "moments", "response", "singles"},
+    "distribution": {
+        "averages", "errors", "integrals", "moments", "photometry", "prediction", "response", "singles", "systems",
+    },
+    "uncertainty": {
+        "averages", "integrals", "multiplicity", "photometry", "prediction", "response", "stars", "systems",
+    },
     "config": {"errors", "multiplicity", "photometry"},
     "sample": {"catalogs", "config", "errors", "galaxy", "stars", "systems"},
     "simulation": {
@@ -74,6 +83,8 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
 }  # fmt: skip
 NEVER_REACHED = {  # followed through every module in between
     "prediction": {"stack", "simulation"},
+    "distribution": {"stack", "simulation"},
+    "uncertainty": {"stack", "simulation"},
     "images": {"response", "weighted", "stack", "prediction"},
     "stack": {"prediction", "response", "psf"},
     "figures": {"prediction", "stack", "simulation", "summary"},

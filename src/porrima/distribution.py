@@ -123,7 +123,9 @@ class SizeDistribution:
         """
         wanted = np.asarray(probability, dtype=float)
         if np.any(~((wanted >= 0) & (wanted <= 1))):
-            raise ValueError(f"probability must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}")
+            raise ValueError(
+                f"probability must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}"
+            )
         negative = np.interp(0.0, self.value, self.cumulative, left=0.0, right=1.0 - self.none)
         beyond = np.where(wanted <= negative, wanted, np.maximum(wanted - self.none, negative))
         return np.interp(beyond, self.cumulative, self.value)
@@ -181,7 +183,7 @@ def size_distribution(
     if math.isnan(bias):
         raise InputError("is too wide for the kernel moments of this PSF", key="cut", value=population.cut)
     density = pair_density(population, integrals, binary_fraction)
-    push = moments.mean[0] @ response.second[2] * (n_stars - 1) / n_stars**2
+    push = moments.mean[0] @ response.second[2] / float(response.shape0.r2) * (n_stars - 1) / n_stars**2
     added = _added_sizes(density, response, population.cut, n_stars, push)
     share = np.broadcast_to(density.share / added.shape[0], added.shape)
     mean = n_stars * np.sum(share * added)
@@ -243,7 +245,20 @@ def pair_density(
 
 @njit(cache=True)
 def _count_pairs(  # type: ignore[no-untyped-def]
-    grid, log_mass_min, dark_below, index, weight, mass, q_min, exponent, given, kind, place, pair, count, total
+    grid,
+    log_mass_min,
+    dark_below,
+    index,
+    weight,
+    mass,
+    q_min,
+    exponent,
+    given,
+    kind,
+    place,
+    pair,
+    count,
+    total,
 ):
     """Pairs that shine by kind of orbit, place of the cut and 4 y; and the sums of 1 and of 4 y in each cell."""
     to_log, to_exponent = 1.0 / math.log(10.0), -0.4 * math.log(10.0)
@@ -288,13 +303,10 @@ def _added_sizes(
     """
     node = 0.5 * (1.0 - np.cos(math.pi * (np.arange(_DEGREE + 1) + 0.5) / (_DEGREE + 1)))
     angle = 2.0 * math.pi * (np.arange(ANGLES) + 0.5) / ANGLES
-    turned, four_y, square = (
-        part.ravel() for part in np.meshgrid(angle, node, node, indexing="ij")
-    )
+    turned, four_y, square = (part.ravel() for part in np.meshgrid(angle, node, node, indexing="ij"))
     kernel = pair_moments(four_y, cut * np.sqrt(square), turned)
     change, _ = added_shapes(response, kernel.reshape(-1, N_MOMENTS) / n_stars)
     size = (change[:, 2] + kernel @ push).reshape(2, ANGLES // 2, node.size, node.size)
-    size = size / float(response.shape0.r2)
     even, odd = 0.5 * (size[0] + size[1]), 0.5 * (size[0] - size[1])
     root = np.sqrt(node)
     even = even / np.multiply.outer(node, node)
@@ -309,8 +321,7 @@ def _added_sizes(
 def _interpolation(node: FloatArray, at: FloatArray) -> FloatArray:
     """Matrix from values at nodes to those of their polynomial elsewhere, (n, n_node)."""
     powers = np.vander(node, increasing=True)
-    matrix: FloatArray = np.linalg.solve(powers.T, np.vander(at, node.size, increasing=True).T).T
-    return matrix
+    return np.asarray(np.linalg.solve(powers.T, np.vander(at, node.size, increasing=True).T).T, dtype=float)
 
 
 def _sum_of_stars(

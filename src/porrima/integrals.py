@@ -78,9 +78,7 @@ class PairIntegrals:
 
     def _of(self, terms: list[tuple[int, FloatArray]]) -> FloatArray:
         """Expectation of some polynomials in 4 y, each times a power of r."""
-        columns = [
-            (self.coefficient[0] @ c) * self.separation[0, :, n // 2] * self.cut**n for n, c in terms
-        ]
+        columns = [(self.coefficient[0] @ c) * self.separation[0, :, n // 2] * self.cut**n for n, c in terms]
         return np.stack(columns, axis=1)
 
 
@@ -117,7 +115,7 @@ def coefficient_polynomial(n: int, m: int = 0) -> FloatArray:
     else:
         result = y**2 * (1 - 4 * y) * recursion(0.0, n - 1) * recursion(0.0, m - 1)
     out = np.zeros(ORDER + 1)
-    found = result.trim().coef
+    found = np.asarray(result.trim().coef, dtype=float)
     out[: found.size] = found / 4.0 ** np.arange(found.size)
     return out
 

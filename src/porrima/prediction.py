@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -61,9 +61,13 @@ class Prediction:
         Bias and covariance are NaN where the pairs are too wide for a series in kernel moments, see `predict`.
     covariance : (3, 3, k) float array
         Covariance of the three about their means, dimensionless.
+    log_covariance : (3, 3, k) float array
+        Covariance of e1, e2 and ln R² about their means, dimensionless.
     crossover_n_stars : (3, k) float array
         Number of stars at which the bias overtakes the scatter: below 1 where it always does, infinite where there
         is no bias (count).
+    series : (4, k) float array
+        Share of the orders 2, 4, 6 and 8 of the kernel moments in the mean change of size, dimensionless.
     """
 
     population: PopulationMoments
@@ -71,12 +75,15 @@ class Prediction:
     r2_0: float
     bias: FloatArray
     covariance: FloatArray
+    log_covariance: FloatArray
     crossover_n_stars: FloatArray
+    series: FloatArray
 
     @property
     def sd(self) -> FloatArray:
         """Standard deviation about the mean, (3, k), dimensionless."""
-        return np.sqrt(np.maximum(np.einsum("qqk->qk", self.covariance), 0.0))
+        variance: FloatArray = np.einsum("qqk->qk", self.covariance)
+        return np.sqrt(np.maximum(variance, 0.0))
 
     @property
     def sigma(self) -> FloatArray:
@@ -89,14 +96,27 @@ class Prediction:
         return self.population.mean_x / self.r2_0
 
     @property
-    def log_size_covariance(self) -> FloatArray:
-        """Covariance of e1, e2 and ln R² of the stack, (3, 3, k), dimensionless: that of R² over its mean size.
+    def last_order(self) -> NDArray[np.int64]:
+        """Order at which the expansion stops being good: the first whose successor is no smaller, or 8; (k,)."""
+        grows = np.abs(self.series[1:]) >= np.abs(self.series[:-1])
+        return np.where(grows.any(axis=0), np.array(EVEN)[np.argmax(grows, axis=0)], ORDER)
 
-        To second order in the scatter of R²/R0², so 1 % at one star and nothing from 40 on.
-        """
-        unit = np.ones((3, self.bias.shape[1]))
-        unit[2] = 1.0 / (1.0 + self.bias[2])
-        return self.covariance * unit[:, None] * unit[None, :]
+
+class _Derivatives(NamedTuple):
+    """First (4, n_moment) and second (4, n_moment, n_moment) derivative of e1, e2, R² over R0² and ln R²."""
+
+    first: FloatArray
+    second: FloatArray
+
+    @classmethod
+    def of(cls, response: Response) -> _Derivatives:
+        """Those of a response."""
+        r2_0 = float(response.shape0.r2)
+        size, curved = response.first[2:] / r2_0, response.second[2:] / r2_0
+        return cls(
+            first=np.concatenate([response.first[:2], size, size]),
+            second=np.concatenate([response.second[:2], curved, curved - size.T @ size]),
+        )
 
 
 def predict(moments: PopulationMoments, response: Response, n_stars: int | None = None) -> Prediction:
@@ -154,70 +174,75 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
     """
     if n_stars is not None and n_stars < 1:
         raise ValueError(f"n_stars must be at least 1, got {n_stars}")
-    limit, scatter = _endless(moments, response)
+    by_moments = _Derivatives.of(response)
+    limit, scatter = _endless(moments, by_moments)
     if n_stars is None:
-        bias, covariance = limit.copy(), np.zeros((3, 3, limit.shape[1]))
+        bias, covariance = limit, np.zeros((4, 4, limit.shape[1]))
     elif n_stars >= MANY_STARS or not moments.equal_weights:
-        bias, covariance = _about_the_mean(moments, response, n_stars)
+        bias, covariance = _about_the_mean(moments, by_moments, n_stars)
     else:
-        bias, covariance = _star_by_star(moments, response, n_stars)
-    r2_0 = float(response.shape0.r2)
-    unit = np.array([1.0, 1.0, r2_0])
-    biased = np.abs(limit) > _NO_BIAS * unit[:, None]
+        bias, covariance = _star_by_star(moments, by_moments, n_stars, response)
+    biased = np.abs(limit) > _NO_BIAS
     crossover = np.divide(scatter, limit**2, out=np.full_like(scatter, np.inf), where=biased)
     orders = series_orders(moments, response)
     diverged = np.abs(orders[-1]) > SERIES_LIMIT
-    if np.any(diverged):
-        warnings.warn(_series_text(moments, response, orders[:, diverged][:, 0]), SeriesWarning, stacklevel=2)
     for result in (bias, covariance, crossover):
         result[..., diverged] = np.nan
-    return Prediction(
+    logarithmic = [0, 1, 3]
+    prediction = Prediction(
         population=moments,
         n_stars=n_stars,
-        r2_0=r2_0,
-        bias=bias / unit[:, None],
-        covariance=covariance / np.multiply.outer(unit, unit)[:, :, None],
-        crossover_n_stars=crossover,
+        r2_0=float(response.shape0.r2),
+        bias=bias[:3],
+        covariance=covariance[:3, :3],
+        log_covariance=covariance[np.ix_(logarithmic, logarithmic)],
+        crossover_n_stars=crossover[:3],
+        series=orders,
     )
+    if np.any(diverged):
+        text = _series_text(prediction, response, int(np.argmax(diverged)))
+        warnings.warn(text, SeriesWarning, stacklevel=2)
+    return prediction
 
 
-def _endless(moments: PopulationMoments, response: Response) -> tuple[FloatArray, FloatArray]:
-    """Change of shape of an endless stack, and N times the variance of a long one, both (3, k)."""
-    bending = _bending(response, moments.mean)
-    bias = response.first @ moments.mean.T + 0.5 * np.einsum("kqi,ki->qk", bending, moments.mean)
-    gradient = response.first + bending
+def _endless(moments: PopulationMoments, by_moments: _Derivatives) -> tuple[FloatArray, FloatArray]:
+    """Change of shape of an endless stack, and N times the variance of a long one, both (4, k)."""
+    bending = _bending(by_moments, moments.mean)
+    bias = by_moments.first @ moments.mean.T + 0.5 * np.einsum("kqi,ki->qk", bending, moments.mean)
+    gradient = by_moments.first + bending
     return bias, np.einsum("kqi,kqi->qk", gradient @ moments.covariance, gradient)
 
 
 def _about_the_mean(
-    moments: PopulationMoments, response: Response, n_stars: int
+    moments: PopulationMoments, by_moments: _Derivatives, n_stars: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Change of shape (3, k) and covariance (3, 3, k) to second order about the mean stack."""
+    """Change of shape (4, k) and covariance (4, 4, k) to second order about the mean stack."""
     m, c = moments.mean + moments.shift / n_stars, moments.covariance / n_stars
-    bending = _bending(response, m)
-    curved = np.einsum("kqi,ki->qk", bending, m) + np.einsum("qij,kij->qk", response.second, c)
-    gradient = response.first + bending
-    covariance = gradient @ c @ gradient.transpose(0, 2, 1) + 0.5 * _traces(response, c)
-    return response.first @ m.T + 0.5 * curved, covariance.transpose(1, 2, 0)
+    bending = _bending(by_moments, m)
+    curved = np.einsum("kqi,ki->qk", bending, m) + np.einsum("qij,kij->qk", by_moments.second, c)
+    gradient = by_moments.first + bending
+    covariance = gradient @ c @ gradient.transpose(0, 2, 1) + 0.5 * _traces(by_moments, c)
+    return by_moments.first @ m.T + 0.5 * curved, covariance.transpose(1, 2, 0)
 
 
-def _bending(response: Response, mean: FloatArray) -> FloatArray:
-    """Second derivatives times mean moments, (k, 3, n_moment)."""
-    return (mean @ response.second.reshape(-1, mean.shape[1]).T).reshape(mean.shape[0], 3, -1)
+def _bending(by_moments: _Derivatives, mean: FloatArray) -> FloatArray:
+    """Second derivatives times mean moments, (k, 4, n_moment)."""
+    bending: FloatArray = mean @ by_moments.second.reshape(-1, mean.shape[1]).T
+    return bending.reshape(mean.shape[0], -1, mean.shape[1])
 
 
-def _traces(response: Response, covariance: FloatArray) -> FloatArray:
-    """tr(B_q C B_r C), (k, 3, 3)."""
-    turned = response.second @ covariance[:, None]
-    rows = turned.reshape(turned.shape[0], 3, -1)
-    traces: FloatArray = rows @ turned.transpose(0, 3, 2, 1).reshape(turned.shape[0], -1, 3)
+def _traces(by_moments: _Derivatives, covariance: FloatArray) -> FloatArray:
+    """tr(B_q C B_r C), (k, 4, 4)."""
+    turned = by_moments.second @ covariance[:, None]
+    k, q = turned.shape[:2]
+    traces: FloatArray = turned.reshape(k, q, -1) @ turned.transpose(0, 3, 2, 1).reshape(k, -1, q)
     return traces
 
 
 def _star_by_star(
-    moments: PopulationMoments, response: Response, n_stars: int
+    moments: PopulationMoments, by_moments: _Derivatives, n_stars: int, response: Response
 ) -> tuple[FloatArray, FloatArray]:
-    """Change of shape (3, k) and covariance (3, 3, k), exact in what a single star adds."""
+    """Change of shape (4, k) and covariance (4, 4, k), exact in what a single star adds."""
     added = added_to_shape(response, moments.cut, n_stars)
     if added.n_too_wide and np.any(moments.unresolved_fraction > 0):
         text = (
@@ -225,19 +250,22 @@ def _star_by_star(
             f"at n_stars = {n_stars} and are taken to second order"
         )
         warnings.warn(text, SeriesWarning, stacklevel=3)
-    weight, n_moments = node_weights(moments.powers), moments.mean.shape[1]
-    m, c = moments.mean, moments.covariance
-    bending = _bending(response, m)
-    alone = weight @ added.mean
+    weight, m, c = node_weights(moments.powers), moments.mean, moments.covariance
+
+    def average(values: FloatArray) -> FloatArray:
+        return (weight @ values.reshape(values.shape[0], -1)).reshape(-1, *values.shape[1:])
+
+    bending = _bending(by_moments, m)
+    alone = average(added.mean)
     bias = n_stars * alone + 0.5 * (1 - 1 / n_stars) * np.einsum("kqi,ki->kq", bending, m)
     push = bending * (n_stars - 1) / n_stars**2  # on a star's moments, from the others
     pulled = push.transpose(0, 2, 1)
-    mixed = (weight @ added.with_moments.reshape(-1, 3 * n_moments)).reshape(-1, 3, n_moments) @ pulled
-    square = (weight @ added.product.reshape(-1, 9)).reshape(-1, 3, 3) + mixed + mixed.transpose(0, 2, 1)
+    mixed = average(added.with_moments) @ pulled
+    square = average(added.product) + mixed + mixed.transpose(0, 2, 1)
     square += push @ (c + m[:, :, None] * m[:, None, :]) @ pulled
     mean = alone + np.einsum("kqi,ki->kq", push, m)
     covariance = n_stars * (square - mean[:, :, None] * mean[:, None, :])
-    covariance += 0.5 * (n_stars - 1) / n_stars**3 * _traces(response, c)
+    covariance += 0.5 * (n_stars - 1) / n_stars**3 * _traces(by_moments, c)
     return bias.T, covariance.transpose(1, 2, 0)
 
 
@@ -263,13 +291,11 @@ def series_orders(moments: PopulationMoments, response: Response) -> FloatArray:
     return share
 
 
-def _series_text(moments: PopulationMoments, response: Response, share: FloatArray) -> str:
+def _series_text(prediction: Prediction, response: Response, k: int) -> str:
     """What is wrong with a series that does not converge."""
-    grown = np.flatnonzero(np.abs(share[1:]) >= np.abs(share[:-1]))
-    stops = EVEN[grown[0]] if grown.size else ORDER
-    shown = ", ".join(f"{100 * part:+.3g} %" for part in share)
+    shown = ", ".join(f"{100 * part:+.3g} %" for part in prediction.series[:, k])
     return (
-        f"cut {moments.cut} arcsec is too wide for the kernel moments of {response.psf} ({response.estimator}): orders "
-        f"{', '.join(map(str, EVEN))} make {shown} of the size change, and the expansion stops being good at order "
-        f"{stops}"
+        f"cut {prediction.population.cut} arcsec is too wide for the kernel moments of {response.psf} "
+        f"({response.estimator}): orders {', '.join(map(str, EVEN))} make {shown} of the size change, and the "
+        f"expansion stops being good at order {prediction.last_order[k]}"
     )

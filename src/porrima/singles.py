@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["ANGLES", "AddedShape", "added_to_shape", "added_shapes", "node_weights", "pair_moments"]
+__all__ = ["ANGLES", "AddedShape", "added_shapes", "added_to_shape", "node_weights", "pair_moments"]
 
 ANGLES = 24
 """Orientations of a pair: kernels of order 8 turn no faster than eight times, products sixteen times (count)."""
@@ -34,11 +34,11 @@ class AddedShape:
 
     Parameters
     ----------
-    mean : (n_node, 3) float array
-        Change of e1, e2 and r2; r2 in arcsec².
-    product : (n_node, 3, 3) float array
+    mean : (n_node, 4) float array
+        Change of e1, e2, R² over R0² and ln R², dimensionless.
+    product : (n_node, 4, 4) float array
         Mean product of two changes.
-    with_moments : (n_node, 3, n_moment) float array
+    with_moments : (n_node, 4, n_moment) float array
         Mean product of a change and a kernel moment, the latter in arcsec^(a+b).
     n_too_wide : int
         Pairs for which there is no exact shape, taken to second order (count).
@@ -77,7 +77,7 @@ def node_weights(powers: FloatArray) -> FloatArray:
     weight : (k, 64) float array
         For functions that vanish without a companion; exact for polynomials of degree 8 in y and in r².
     """
-    weight = np.einsum("aj,kjl,bl->kab", _from_powers(), powers, _from_powers(), optimize=True)
+    weight: FloatArray = np.einsum("aj,kjl,bl->kab", _from_powers(), powers, _from_powers(), optimize=True)
     return weight.reshape(powers.shape[0], -1)
 
 
@@ -115,8 +115,8 @@ def added_shapes(response: Response, moments: FloatArray) -> tuple[FloatArray, i
 
     Returns
     -------
-    change, n_too_wide : (n, 3) float array, int
-        Of e1, e2 and r2, r2 in arcsec²; and how many had to be taken to second order (count).
+    change, n_too_wide : (n, 4) float array, int
+        Of e1, e2, R² over R0² and ln R², dimensionless; and how many had to be taken to second order (count).
     """
     shape, zero = response.shapes(KernelMoments(values=moments, n_stars=1)), response.shape0
     change = np.stack([shape.e1 - zero.e1, shape.e2 - zero.e2, shape.r2 - zero.r2], axis=1)
@@ -125,7 +125,8 @@ def added_shapes(response: Response, moments: FloatArray) -> tuple[FloatArray, i
     change[wide] = some @ response.first.T + 0.5 * np.einsum(
         "ni,qij,nj->nq", some, response.second, some, optimize=True
     )
-    return change, int(wide.sum())
+    relative = change[:, 2:] / float(zero.r2)
+    return np.concatenate([change[:, :2], relative, np.log1p(relative)], axis=1), int(wide.sum())
 
 
 def added_to_shape(response: Response, cut: float, n_stars: int) -> AddedShape:
@@ -143,7 +144,7 @@ def added_to_shape(response: Response, cut: float, n_stars: int) -> AddedShape:
     Returns
     -------
     added : AddedShape
-        On 64 nodes, r2 in arcsec².
+        On 64 nodes, dimensionless.
     """
     nodes = _nodes()
     four_y, square, angle = (
@@ -152,7 +153,7 @@ def added_to_shape(response: Response, cut: float, n_stars: int) -> AddedShape:
     )
     kernel = pair_moments(four_y, cut * np.sqrt(square), angle)
     change, n_too_wide = added_shapes(response, kernel / n_stars)
-    change, kernel = change.reshape(-1, ANGLES, 3), kernel.reshape(-1, ANGLES, N_MOMENTS)
+    change, kernel = change.reshape(-1, ANGLES, change.shape[1]), kernel.reshape(-1, ANGLES, N_MOMENTS)
     return AddedShape(
         mean=change.mean(axis=1),
         product=np.einsum("nta,ntb->nab", change, change) / ANGLES,
