@@ -154,7 +154,8 @@ def predicted(
     population = population_of(config, draw_stars(config))
     fraction = None if binary_fraction is None else np.array([binary_fraction])
     moments = population_moments(population, integrate(population), fraction)
-    with warnings.catch_warnings(action="ignore", category=SeriesWarning):  # said again, as an error, below
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", SeriesWarning)
         prediction = predict(moments, reply, n_stars)
     if np.any(np.isnan(prediction.bias)):
         rule = (
@@ -162,6 +163,8 @@ def predicted(
             f"{prediction.last_order[0]}: use --estimator plain, or simulate --method images"
         )
         raise InputError(rule, key="--cut", value=config.cut)
+    for warning in said:
+        warnings.warn(warning.message, stacklevel=2)
     errors = {
         f"{name}_{quantity}": value
         for name in ("bias", "sigma", "sd")

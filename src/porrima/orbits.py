@@ -55,7 +55,7 @@ def projection_nodes(
     -----
     The factor is :math:`\sqrt{1 - m^2}`.  Isotropic: m is uniform in (0, 1).  Inclination-uniform: m is the product of
     two sines of uniform angles, with the density :math:`(2/\pi)^2 K(\sqrt{1-m^2})` (the complete elliptic integral).
-    By :math:`m = \sin(\frac{\pi}{2} s^2)`, which takes its logarithm at m = 0, Gauss-Legendre in s.
+    By :math:`m = \sin(\frac{\pi}{2} s^4)`, which takes its logarithm at m = 0, Gauss-Legendre in s.
     The mean square of the factor is 2/3 and 3/4.
     """
     x, w = np.polynomial.legendre.leggauss(nodes)
@@ -63,12 +63,12 @@ def projection_nodes(
     if kink is None:
         s, ds = unit, unit_weight
     else:
-        split = np.sqrt(np.arccos(kink) / (0.5 * math.pi))[:, None]
+        split = (np.arccos(kink) / (0.5 * math.pi))[:, None] ** 0.25
         s = np.concatenate([split * unit, split + (1 - split) * unit], axis=1)
         ds = np.concatenate([split * unit_weight, (1 - split) * unit_weight], axis=1)
-    angle = 0.5 * math.pi * s**2
+    angle = 0.5 * math.pi * s**4
     factor = np.cos(angle)
-    weight = math.pi * s * ds * factor
+    weight = 2 * math.pi * s**3 * ds * factor
     if projection == "inclination-uniform":
         weight = weight * (2 / math.pi) ** 2 * ellipkm1(np.maximum(np.sin(angle) ** 2, 1e-300))
     return factor, weight / weight.sum(axis=-1, keepdims=True)

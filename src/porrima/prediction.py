@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from porrima.response import Response
+    from porrima.singles import AddedShape
 
     FloatArray = NDArray[np.float64]
 
@@ -175,13 +176,16 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
     if n_stars is not None and n_stars < 1:
         raise ValueError(f"n_stars must be at least 1, got {n_stars}")
     by_moments = _Derivatives.of(response)
+    n_too_wide = 0
     limit, scatter = _endless(moments, by_moments)
     if n_stars is None:
         bias, covariance = limit, np.zeros((4, 4, limit.shape[1]))
     elif n_stars >= MANY_STARS or not moments.equal_weights:
         bias, covariance = _about_the_mean(moments, by_moments, n_stars)
     else:
-        bias, covariance = _star_by_star(moments, by_moments, n_stars, response)
+        added = added_to_shape(response, moments.cut, n_stars)
+        n_too_wide = added.n_too_wide
+        bias, covariance = _star_by_star(moments, by_moments, n_stars, added)
     biased = np.abs(limit) > _NO_BIAS
     crossover = np.divide(scatter, limit**2, out=np.full_like(scatter, np.inf), where=biased)
     orders = series_orders(moments, response)
@@ -201,6 +205,12 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
     )
     if np.any(diverged):
         text = _series_text(prediction, response, int(np.argmax(diverged)))
+        warnings.warn(text, SeriesWarning, stacklevel=2)
+    elif n_too_wide and np.any(moments.unresolved_fraction > 0):
+        text = (
+            f"cut {moments.cut} arcsec: single pairs near it are too wide for {response.psf} ({response.estimator}) "
+            f"at n_stars = {n_stars} and are taken to second order"
+        )
         warnings.warn(text, SeriesWarning, stacklevel=2)
     return prediction
 
@@ -240,16 +250,9 @@ def _traces(by_moments: _Derivatives, covariance: FloatArray) -> FloatArray:
 
 
 def _star_by_star(
-    moments: PopulationMoments, by_moments: _Derivatives, n_stars: int, response: Response
+    moments: PopulationMoments, by_moments: _Derivatives, n_stars: int, added: AddedShape
 ) -> tuple[FloatArray, FloatArray]:
     """Change of shape (4, k) and covariance (4, 4, k), exact in what a single star adds."""
-    added = added_to_shape(response, moments.cut, n_stars)
-    if added.n_too_wide and np.any(moments.unresolved_fraction > 0):
-        text = (
-            f"cut {moments.cut} arcsec: single pairs near it are too wide for {response.psf} ({response.estimator}) "
-            f"at n_stars = {n_stars} and are taken to second order"
-        )
-        warnings.warn(text, SeriesWarning, stacklevel=3)
     weight, m, c = node_weights(moments.powers), moments.mean, moments.covariance
 
     def average(values: FloatArray) -> FloatArray:

@@ -126,7 +126,8 @@ def added_shapes(response: Response, moments: FloatArray) -> tuple[FloatArray, i
         "ni,qij,nj->nq", some, response.second, some, optimize=True
     )
     relative = change[:, 2:] / float(zero.r2)
-    return np.concatenate([change[:, :2], relative, np.log1p(relative)], axis=1), int(wide.sum())
+    logarithm = np.log1p(np.maximum(relative, -0.5))  # second order may pass 0 where it means nothing
+    return np.concatenate([change[:, :2], relative, logarithm], axis=1), int(wide.sum())
 
 
 def added_to_shape(response: Response, cut: float, n_stars: int) -> AddedShape:
