@@ -40,6 +40,8 @@ _Y_CELLS, _Y_DECADES = 200, 5  # cells in log 4 y
 _R_CELLS, _R_DECADES = 400, 4  # cells in log r
 _DEGREE = 7  # of the polynomials in y and in r² between cells
 _LATTICE = 1 << 18  # points of the transform
+_FINE = 8  # steps of the lattice about 0 within which it is refined
+_TINY = 1e-30
 _REACH = 12.0  # standard deviations beyond the mean that the lattice holds
 
 
@@ -73,7 +75,7 @@ class SizeDistribution:
     value : (n,) float array
         Ascending size errors, dimensionless.
     cumulative : (n,) float array
-        Probability of a smaller one, stacks without any companion left aside, in [0, 1].
+        Probability of one at most as large, stacks without any companion left aside, in [0, 1].
     none : float
         Probability of no companion that shines, and so of no error, in [0, 1].
     prediction : Prediction
@@ -126,9 +128,11 @@ class SizeDistribution:
             raise ValueError(
                 f"probability must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}"
             )
-        negative = np.interp(0.0, self.value, self.cumulative, left=0.0, right=1.0 - self.none)
-        beyond = np.where(wanted <= negative, wanted, np.maximum(wanted - self.none, negative))
-        return np.interp(beyond, self.cumulative, self.value)
+        negative = np.interp(0.0, self.value, self.cumulative)
+        below = np.interp(wanted, self.cumulative, self.value)
+        above = np.interp(wanted - self.none, self.cumulative, self.value)
+        quantile = np.where(wanted < negative, below, np.maximum(above, 0.0))
+        return np.where((wanted >= negative) & (wanted <= negative + self.none), 0.0, quantile)
 
 
 def size_distribution(
@@ -190,7 +194,7 @@ def size_distribution(
     if mean != 0:
         added = added * (bias / mean)
     none = (1.0 - density.share.sum()) ** n_stars
-    value, cumulative = _sum_of_stars(added.ravel(), share.ravel(), n_stars, none)
+    value, cumulative = _sum_of_stars(added.ravel(), share.ravel(), n_stars)
     return SizeDistribution(
         n_stars=n_stars, value=value, cumulative=cumulative, none=none, prediction=prediction
     )
@@ -324,26 +328,39 @@ def _interpolation(node: FloatArray, at: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(powers.T, np.vander(at, node.size, increasing=True).T).T, dtype=float)
 
 
-def _sum_of_stars(
-    added: FloatArray, share: FloatArray, n_stars: int, none: float
-) -> tuple[FloatArray, FloatArray]:
-    """Values of the sum over stars and the probability of less, sums of nothing left aside."""
-    if n_stars == 1:
-        order = np.argsort(added)
-        value, mass = added[order], share[order]
-        return value, np.cumsum(mass) - 0.5 * mass
+def _sum_of_stars(added: FloatArray, share: FloatArray, n_stars: int) -> tuple[FloatArray, FloatArray]:
+    """Values of the sum over stars and the probability of less, sums of nothing left aside.
+
+    Sums with one pair alone are as finely known as the pairs themselves, also next to 0; those with more come from
+    the lattice.
+    """
+    alone = 1.0 - share.sum()
     mean, square = n_stars * np.sum(share * added), n_stars * np.sum(share * added**2)
     spread = _REACH * math.sqrt(square)
     low = min(0.0, mean - spread, 2 * added.min()) if added.min() < 0 else 0.0
-    step = (mean + spread + 2 * max(added.max(), 0.0) - low) / (_LATTICE - 1)
-    place = added / step
-    below = np.floor(place).astype(np.int64)
-    one = np.bincount(below % _LATTICE, weights=share * (below + 1 - place), minlength=_LATTICE)
-    one += np.bincount((below + 1) % _LATTICE, weights=share * (place - below), minlength=_LATTICE)
-    one[0] += 1.0 - share.sum()
-    many = np.fft.irfft(np.fft.rfft(one) ** n_stars, _LATTICE)
-    many[0] -= none
+    step = max(mean + spread + 2 * max(added.max(), 0.0) - low, _TINY) / (_LATTICE - 1)
     first = round(low / step)
-    value = (first + np.arange(_LATTICE)) * step + 0.5 * step
-    cumulative = np.maximum.accumulate(np.cumsum(np.maximum(np.roll(many, -first), 0.0)))
-    return value, cumulative
+    small = np.geomspace(1e-6, _FINE, 50 * _FINE) * step
+    value = (first + np.arange(_LATTICE) + 0.5) * step
+    value = np.concatenate(
+        [value[value < -_FINE * step], -small[::-1], [0.0], small, value[value > _FINE * step]]
+    )
+    one = np.bincount(np.searchsorted(value, added), weights=share, minlength=value.size)[: value.size]
+    cumulative = n_stars * alone ** (n_stars - 1) * np.cumsum(one)
+    if n_stars > 1:
+        more = np.cumsum(np.roll(_pairs_on_lattice(added / step, share, n_stars), -first))
+        edge = (first + np.arange(-1, _LATTICE) + 0.5) * step
+        edge[edge == -0.5 * step] = 0.0 if first == 0 else -0.5 * step
+        cumulative += np.interp(value, edge, np.append(0.0, more))
+    return value, np.maximum.accumulate(cumulative)
+
+
+def _pairs_on_lattice(place: FloatArray, share: FloatArray, n_stars: int) -> FloatArray:
+    """Probability of each sum over stars with two pairs or more, in steps of a lattice that closes on itself."""
+    alone = 1.0 - share.sum()
+    below = np.floor(place).astype(np.int64)
+    pair = np.bincount(below % _LATTICE, weights=share * (below + 1 - place), minlength=_LATTICE)
+    pair += np.bincount((below + 1) % _LATTICE, weights=share * (place - below), minlength=_LATTICE)
+    turned = np.fft.rfft(pair)
+    many = (alone + turned) ** n_stars - alone**n_stars - n_stars * alone ** (n_stars - 1) * turned
+    return np.maximum(np.fft.irfft(many, _LATTICE), 0.0)
