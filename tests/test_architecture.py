@@ -71,6 +71,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "io": {"files", "errors", "systems", "tables"},
     "experiments": {"config", "galaxy", "multiplicity", "prediction", "simulation", "stars", "summary"},
     "figures": {"instruments", "stars"},
+    "scatter_figure": {"figures"},
     "report": {"files", "experiments", "figures", "instruments", "io", "summary"},
     "bench": {"config", "psf", "response", "sample", "shapes", "stack", "systems"},
     "terminal": set(),
