@@ -164,7 +164,7 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
     .. math:: sd(R^2)/R_0^2 = \sqrt{(\langle x^2\rangle - \langle x\rangle^2)/N}/R_0^2, \qquad
        sd(e_i) = \sqrt{[\langle x^2\rangle/2 + e_i^2(\langle x^2\rangle - \langle x\rangle^2)]/N}/R_0^2,
 
-    the first exact, the second 6 % too large at N = 1 and 1 % at 5, and for N → ∞ KCM16 Eqs. 7-12 with their
+    the first exact, the second 5 % too large at N = 1 and 1 % at 5, and for N → ∞ KCM16 Eqs. 7-12 with their
     second-order term.  Where the moments of order 8 make up more than `response.SERIES_LIMIT` of the mean size
     change, the series has not converged and the result is NaN: a cut near the width of the PSF.  Plain moments have
     no such limit.

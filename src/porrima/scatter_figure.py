@@ -21,9 +21,10 @@ def scatter_of_stacks(stacks: xr.Dataset) -> Figure:
     Parameters
     ----------
     stacks : Dataset
-        ``sd``, ``sd_se``, ``sd_predicted`` and ``sd_first_order`` over (case, quantity, n_stars), and ``quantile``,
-        ``quantile_lo``, ``quantile_hi`` (simulated, and the ends of what its error allows), ``quantile_predicted``
-        over (case, probability, n_stars), dimensionless.
+        Simulated: ``ratio`` of the scatter to its first-order form and ``ratio_se`` over (case, quantity, n_stars),
+        ``quantile`` and the ends of what its error allows, ``quantile_lo`` and ``quantile_hi``, over (case,
+        probability, n_stars).  Predicted: ``ratio_predicted`` over (case, quantity, n_line) and
+        ``quantile_predicted`` over (probability, n_line), for the last case.  Dimensionless.
 
     Returns
     -------
@@ -60,13 +61,12 @@ def _scatter(axis: Any, stacks: xr.Dataset, quantity: str) -> None:
     n = stacks["n_stars"].to_numpy()
     for k, case in enumerate(stacks["case"].to_numpy()):
         here = stacks.sel(case=case, quantity=quantity)
-        first = here["sd_first_order"]
         colour = _COLOURS[k]
         axis.errorbar(
-            n * 1.06 ** (k - 1.5), here["sd"] / first, yerr=here["sd_se"] / first,
+            n * 1.06 ** (k - 1.5), here["ratio"], yerr=here["ratio_se"],
             color=colour, marker=_MARKERS[k], markersize=3.6, linestyle="none", linewidth=0.9, label=str(case),
         )  # fmt: skip
-        axis.plot(n, here["sd_predicted"] / first, color=colour, linewidth=1.1)
+        axis.plot(here["n_line"], here["ratio_predicted"], color=colour, linewidth=1.1)
 
 
 def _quantiles(axis: Any, stacks: xr.Dataset) -> None:
@@ -76,13 +76,13 @@ def _quantiles(axis: Any, stacks: xr.Dataset) -> None:
         here = stacks.sel(probability=probability)
         value = here["quantile"].where(here["quantile"] > 0)
         error = [value - here["quantile_lo"].clip(min=1e-12), here["quantile_hi"] - value]
-        colour = _COLOURS[k % len(_COLOURS)]
+        colour, marker = (*_COLOURS, "0.25")[k % 7], (*_MARKERS, "x")[k % 7]
         axis.errorbar(
-            n, value, yerr=error, color=colour, marker=_MARKERS[k % len(_MARKERS)], markersize=3.6,
+            n, value, yerr=error, color=colour, marker=marker, markersize=3.6,
             linestyle="none", linewidth=0.9, label=f"{100 * float(probability):g} %",
         )  # fmt: skip
         predicted = here["quantile_predicted"]
-        axis.plot(n, predicted.where(predicted > 1e-9), color=colour, linewidth=1.1)
+        axis.plot(here["n_line"], predicted.where(predicted > 1e-9), color=colour, linewidth=1.1)
     axis.set_yscale("log")
     axis.set_ylim(3e-5, 0.2)
     axis.set_ylabel(r"quantiles of $\delta R^2/R_0^2$")
