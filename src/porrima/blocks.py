@@ -178,12 +178,6 @@ def _primaries(alias, block):  # type: ignore[no-untyped-def]
 
 
 @_loop
-def _laws(block):  # type: ignore[no-untyped-def]
-    for lane in range(LANES):
-        block[_ROW_NUMBER + lane] = block[_STAR + LAW * LANES + lane]
-
-
-@_loop
 def _axes(block):  # type: ignore[no-untyped-def]
     """Binary logarithm of the semi-major axes; the tail of the normal law only where a lane is in it."""
     tails = int32(0)
@@ -227,7 +221,7 @@ def _companion_masses(block):  # type: ignore[no-untyped-def]
 def _places(start, per_unit, n_grid, block):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
         k, t = place_on_track(block[_MASS + lane], start, per_unit, n_grid)
-        row = bits(block[_STAR + BASE * LANES + lane]) * int32(n_grid) + k
+        row = bits(block[_STAR + BASE * LANES + lane]) + k
         block[_ROW_NUMBER + lane], block[_PLACE + lane] = from_bits(int32(row)), t
 
 
@@ -246,7 +240,7 @@ def _flux_ratios(log_dark, block):  # type: ignore[no-untyped-def]
 @_loop
 def _validity(scale, is_capped, block):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
-        block[KEPT + lane], block[VALID + lane] = float32(0), float32(1)
+        block[VALID + lane] = float32(1)
     if is_capped:
         for lane in range(LANES):
             mass_word = uint32(bits(block[_WORD + LANES + lane]))
@@ -267,12 +261,11 @@ def draw_numbers(tables, block, key_low, key_high, stack_low, stack_high, first)
 
 @_loop
 def draw_block(tables, block, scale, key_low, key_high, stack_low, stack_high, first):  # type: ignore[no-untyped-def]
-    """Draw the pairs of one block, none of them kept yet; `first` is the number of the first in its stack."""
+    """Draw the pairs of one block; `first` is the number of the first in its stack."""
     _draw_words(tables.isotropic, block, key_low, key_high, stack_low, stack_high, first)
     _primaries(tables.alias, block)
     _take_rows(tables.star, block, _NUMBER, _STAR)
-    _laws(block)
-    _take_rows(tables.law, block, _ROW_NUMBER, _LAW)
+    _take_rows(tables.law, block, _STAR + LAW * LANES, _LAW)
     _axes(block)
     _separations(tables.isotropic, block)
     _companion_masses(block)
@@ -299,6 +292,9 @@ def keep_block(block):  # type: ignore[no-untyped-def]
 def keep_lanes(block, lane, wanted):  # type: ignore[no-untyped-def]
     """The same from a lane on for as many valid pairs as are wanted; the next lane, how many are valid, and kept."""
     valid, kept = int32(0), int32(0)
+    if lane == 0:
+        for k in range(LANES):
+            block[KEPT + k] = float32(0)
     while lane < LANES and valid < wanted:
         is_valid = block[VALID + lane] > float32(0)
         is_kept = is_valid & (block[SEPARATION + lane] < float32(CUT))

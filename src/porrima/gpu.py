@@ -218,7 +218,7 @@ def _draw_pair(tables, scale, key_low, key_high, low, high, pair):  # type: igno
         tables.law[law, Q_FLAT],
     )
     k, t = place_on_track(mass, tables.grid_start, tables.grid_per_unit, tables.n_grid)
-    row, track = bits(tables.star[star, BASE]) * int32(tables.n_grid) + k, tables.track
+    row, track = bits(tables.star[star, BASE]) + k, tables.track
     f = flux_ratio(
         tables.star[star, W1], tables.star[star, W2], tables.star[star, W3], t,
         track[row, 0], track[row, 1], track[row, 2], track[row, 3],

@@ -45,6 +45,9 @@ CUT = 4096.0
 """The cut in the unit of length: eighth powers of 1e-7 to 1 cut are then normal float32.  Where they are not, a CPU
 takes a hundred times as long for a product."""
 
+_WIDEST = 8 * CUT
+"""Separation to which resolved pairs are brought: its eighth power, times a weight of 0, is still a number."""
+
 _SMALLEST = -6.0
 """Binary logarithm of the least semi-major axis, 4e-6 of the cut."""
 
@@ -57,7 +60,7 @@ class Tables(NamedTuple):
 
     A star has the mean of log2(a/d), log2 of the mass that the mass ratio multiplies (the primary's, or
     the companion's where it is given), log2 of the primary's flux, the weights of the second to fourth of its tracks,
-    and the numbers of its group of tracks and of its law (as bits).  A law has the scatter of log2 a, the cumulative
+    and the first row of its group of tracks and that of its law (as bits).  A law has the scatter of log2 a, the cumulative
     probability of the longest axis, the three numbers of the mass ratio (see `companion_mass`), the multiplicity
     fraction.  A track row has log2 of the flux on the four tracks of a group at one mass and at the next.
     """
@@ -119,7 +122,8 @@ def tables_of(population: Population) -> Tables:
         *tracks.weight.T[1:],
     ]
     numbers = [
-        number.astype(np.int32).view(np.float32) for number in (group_number.ravel(), law_number.ravel())
+        number.astype(np.int32).view(np.float32)
+        for number in (group_number.ravel() * (light.shape[0] - 1), law_number.ravel())
     ]
     equal = bool(np.all(population.weight == 1.0))
     return Tables(
@@ -226,9 +230,9 @@ def axis_argument(axis_word, truncation):  # type: ignore[no-untyped-def]
 
 @_step
 def separation(isotropic, log_a, turn_word, phase_word):  # type: ignore[no-untyped-def]
-    """Projected separation of an orbit with log2 of its semi-major axis."""
+    """Projected separation of an orbit with log2 of its semi-major axis, at most `_WIDEST`."""
     rho = projection_factor(isotropic, _unit16(turn_word >> uint32(16)), unit(phase_word))
-    return exp2(smaller(larger(log_a, float32(_SMALLEST)), float32(60.0))) * rho
+    return smaller(exp2(smaller(larger(log_a, float32(_SMALLEST)), float32(60.0))) * rho, float32(_WIDEST))
 
 
 @_step
@@ -298,48 +302,44 @@ def _add5(sums, row, stride, factor, a, b, c, d, e):  # type: ignore[no-untyped-
 
 
 @_step
-def add_moments(sums, lane, stride, kept, f, dx, dy):  # type: ignore[no-untyped-def]
+def add_moments(sums, lane, stride, kept, f, a, b):  # type: ignore[no-untyped-def]
     """Add the kernel moments c_n x^a y^b of a pair of weight `kept` to sums[k stride + lane], c_n = phi_1 (-phi_2)^n
-    + phi_2 phi_1^n.
+    + phi_2 phi_1^n: so c_2 = phi_1 phi_2 and c_(n+1) = (phi_1 - phi_2) c_n + phi_1 phi_2 c_(n-1), of positive terms.
 
     Written out to order 8: only so does a compiler keep the powers in registers.
     """
     # fmt: off
-    a = dx if kept > float32(0) else float32(0)  # a resolved pair may be so wide
-    b = dy if kept > float32(0) else float32(0)  # that its powers overflow
     primary = float32(1) / (float32(1) + f)
-    companion = f * primary
-    fading = -companion if companion > float32(2.0**-12) else float32(0)  # its powers would leave float32, and
-    near = kept * primary * companion * companion  # are below the rounding of the other term
-    far = kept * companion * primary * primary
+    product, difference = f * primary * primary, (float32(1) - f) * primary
+    c, last = kept * product, float32(0)
     m20, m11, m02 = a * a, a * b, b * b
-    _add3(sums, 0 * stride + lane, stride, near + far, m20, m11, m02)
-    near, far = near * fading, far * primary
+    _add3(sums, 0 * stride + lane, stride, c, m20, m11, m02)
+    c, last = difference * c + product * last, c
     m30, m21 = m20 * a, m11 * a
     m12, m03 = m02 * a, m02 * b
-    _add4(sums, 3 * stride + lane, stride, near + far, m30, m21, m12, m03)
-    near, far = near * fading, far * primary
+    _add4(sums, 3 * stride + lane, stride, c, m30, m21, m12, m03)
+    c, last = difference * c + product * last, c
     m40, m31, m22 = m30 * a, m21 * a, m12 * a
     m13, m04 = m03 * a, m03 * b
-    _add5(sums, 7 * stride + lane, stride, near + far, m40, m31, m22, m13, m04)
-    near, far = near * fading, far * primary
+    _add5(sums, 7 * stride + lane, stride, c, m40, m31, m22, m13, m04)
+    c, last = difference * c + product * last, c
     m50, m41, m32 = m40 * a, m31 * a, m22 * a
     m23, m14, m05 = m13 * a, m04 * a, m04 * b
-    _add3(sums, 12 * stride + lane, stride, near + far, m50, m41, m32)
-    _add3(sums, 15 * stride + lane, stride, near + far, m23, m14, m05)
-    near, far = near * fading, far * primary
+    _add3(sums, 12 * stride + lane, stride, c, m50, m41, m32)
+    _add3(sums, 15 * stride + lane, stride, c, m23, m14, m05)
+    c, last = difference * c + product * last, c
     m60, m51, m42, m33 = m50 * a, m41 * a, m32 * a, m23 * a
     m24, m15, m06 = m14 * a, m05 * a, m05 * b
-    _add4(sums, 18 * stride + lane, stride, near + far, m60, m51, m42, m33)
-    _add3(sums, 22 * stride + lane, stride, near + far, m24, m15, m06)
-    near, far = near * fading, far * primary
+    _add4(sums, 18 * stride + lane, stride, c, m60, m51, m42, m33)
+    _add3(sums, 22 * stride + lane, stride, c, m24, m15, m06)
+    c, last = difference * c + product * last, c
     m70, m61, m52, m43 = m60 * a, m51 * a, m42 * a, m33 * a
     m34, m25, m16, m07 = m24 * a, m15 * a, m06 * a, m06 * b
-    _add4(sums, 25 * stride + lane, stride, near + far, m70, m61, m52, m43)
-    _add4(sums, 29 * stride + lane, stride, near + far, m34, m25, m16, m07)
-    near, far = near * fading, far * primary
+    _add4(sums, 25 * stride + lane, stride, c, m70, m61, m52, m43)
+    _add4(sums, 29 * stride + lane, stride, c, m34, m25, m16, m07)
+    c, last = difference * c + product * last, c
     m80, m71, m62, m53, m44 = m70 * a, m61 * a, m52 * a, m43 * a, m34 * a
     m35, m26, m17, m08 = m25 * a, m16 * a, m07 * a, m07 * b
-    _add5(sums, 33 * stride + lane, stride, near + far, m80, m71, m62, m53, m44)
-    _add4(sums, 38 * stride + lane, stride, near + far, m35, m26, m17, m08)
+    _add5(sums, 33 * stride + lane, stride, c, m80, m71, m62, m53, m44)
+    _add4(sums, 38 * stride + lane, stride, c, m35, m26, m17, m08)
     # fmt: on
