@@ -60,9 +60,9 @@ class Tables(NamedTuple):
 
     A star has the mean of log2(a/d), log2 of the mass that the mass ratio multiplies (the primary's, or
     the companion's where it is given), log2 of the primary's flux, the weights of the second to fourth of its tracks,
-    and the first row of its group of tracks and that of its law (as bits).  A law has the scatter of log2 a, the cumulative
-    probability of the longest axis, the three numbers of the mass ratio (see `companion_mass`), the multiplicity
-    fraction.  A track row has log2 of the flux on the four tracks of a group at one mass and at the next.
+    and the first row of its group of tracks and that of its law (as bits).  A law has the scatter of log2 a, the
+    cumulative probability of the longest axis, the three numbers of the mass ratio (see `companion_mass`), the
+    multiplicity fraction.  A track row has log2 of the flux on the four tracks of a group at one mass and at the next.
     """
 
     star: NDArray[np.float32]  # (n, 8)

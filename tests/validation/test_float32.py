@@ -109,6 +109,17 @@ def twin(population, n_stars, fraction, first):
     return sums, kept.sum(axis=1)
 
 
+def statistics(change):
+    """Bias, sigma and sd of the changes of a bin, and their standard errors (docs/how-it-works.md)."""
+    n, bias, sd = change.size, change.mean(), change.std(ddof=1)
+    sigma, fourth = np.sqrt((change**2).sum() / (n - 1)), ((change - bias) ** 4).mean()
+    return {
+        "bias": (bias, sd / np.sqrt(n)),
+        "sigma": (sigma, (change**2).std() / np.sqrt(n) / (2 * sigma)),
+        "sd": (sd, np.sqrt((fourth - sd**4 * (n - 3) / (n - 1)) / n) / (2 * sd)),
+    }
+
+
 @pytest.mark.parametrize(("n_stars", "fractions", "n_stacks"), [(40, "uniform", 20_000), (10_000, 0.35, 150)])
 def test_no_reported_figure_feels_float32(record, n_stars, fractions, n_stacks):
     catalogue = {"catalog": data_file("catalogues/besancon_l200_b90.dat"), "mag": [18, 19]}
