@@ -29,6 +29,7 @@ __all__ = ["Cluster", "cluster"]
 Result = TypeVar("Result")
 
 _AHEAD = 2  # tasks given out per worker, so that none waits for the next one; bounds what is held in memory
+_TOGETHER = 16  # results fetched in one message
 _RECOUNT = 5.0  # s between two looks at how many workers there are
 _ALONE = threading.Lock()  # one task at a time takes all threads of a worker
 
@@ -93,13 +94,22 @@ class Cluster:
             return futures
 
         queue, counted = as_completed(submit(_AHEAD * self._count())), time.monotonic()
-        for future in queue:
-            some = of_future.pop(future.key)
-            queue.update(submit(1))
+        for batch in queue.batches():
+            done = list(batch)
+            queue.update(submit(len(done)))
             if time.monotonic() - counted > _RECOUNT:
                 counted = time.monotonic()
-                queue.update(submit(_AHEAD * self._count() - len(of_future)))
-            yield self._result(future, some)
+                queue.update(submit(_AHEAD * self._count() - len(of_future) + len(done)))
+            for k in range(0, len(done), _TOGETHER):
+                yield from self._gathered({f: of_future.pop(f.key) for f in done[k : k + _TOGETHER]})
+
+    def _gathered(self, futures: dict[Any, tuple[int, int]]) -> Iterator[Any]:
+        """Results of some futures in one message; one by one where there is an error among them."""
+        try:
+            results = self.client.gather(list(futures))
+        except Exception:
+            results = (self._result(*one) for one in futures.items())
+        yield from results
 
     def _count(self) -> int:
         """Number of workers, 1 at least."""

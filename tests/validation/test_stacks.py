@@ -7,7 +7,8 @@ from data_files import data_file
 from porrima.config import RunConfig, parse
 from porrima.moments import INDICES
 from porrima.prediction import integrate, population_moments
-from porrima.simulation import open_run, simulate
+from porrima.simulation import simulate
+from porrima.store import open_run
 from porrima.summary import predicted_curves, summarise
 
 POPULATIONS = {
@@ -49,7 +50,7 @@ def test_every_bin_of_every_panel_agrees_with_the_closed_form(tmp_path, record, 
         estimator: finished(tmp_path, population, estimator, model) for estimator in ("plain", "adaptive")
     }
     for estimator, run in runs.items():
-        summary = summarise(*run)
+        summary = summarise(run)
         pulls = {
             name: ((summary[name] - summary[f"prediction_{name}"]) / summary[f"{name}_se"]).to_numpy()
             for name in ("bias", "sigma", "sd")
@@ -61,14 +62,14 @@ def test_every_bin_of_every_panel_agrees_with_the_closed_form(tmp_path, record, 
             assert pull.size == 180
             assert np.abs(pull).max() < 5, (estimator, name)
         assert not np.any(summary["n_failed"])
-    np.testing.assert_array_equal(runs["plain"][0]["moments"], runs["adaptive"][0]["moments"])
+    np.testing.assert_array_equal(runs["plain"].dataset["moments"], runs["adaptive"].dataset["moments"])
     check_moments(runs["plain"])
     explain(runs, record, population, model)
 
 
 def check_moments(run):
     """The kernel moments themselves, every order, against quadrature at each stack's own binary fraction."""
-    dataset, _, population = run
+    dataset, population = run.dataset, run.population
     grid = np.linspace(0, 1, 501)
     moments = population_moments(population, integrate(population), grid)
     fraction, drawn = dataset["binary_fraction"].to_numpy(), dataset["moments"].to_numpy()
@@ -79,10 +80,12 @@ def check_moments(run):
 
 def explain(runs, record, population, model):
     """Adaptive over plain change of shape, measured on the same stacks and predicted by the response."""
-    fraction = runs["plain"][0]["binary_fraction"].to_numpy()
-    curves = {e: predicted_curves(run[2], run[1], run[1].n_stars)["bias"] for e, run in runs.items()}
+    fraction = runs["plain"].dataset["binary_fraction"].to_numpy()
+    curves = {
+        e: predicted_curves(run.population, run.config, run.config.n_stars)["bias"] for e, run in runs.items()
+    }
     for p, name in (("psf0", "r2"), ("psf1", "r2"), ("psf1", "e1"), ("psf2", "e2")):
-        found = {e: (r[0][name] - r[0][f"{name}_0"]).sel(psf=p).to_numpy() for e, r in runs.items()}
+        found = {e: (r.dataset[name] - r.dataset[f"{name}_0"]).sel(psf=p).to_numpy() for e, r in runs.items()}
         ratio = found["adaptive"].mean() / found["plain"].mean()
         deviation = found["adaptive"] - ratio * found["plain"]
         error = deviation.std() / np.sqrt(N_STACKS) / abs(found["plain"].mean())
