@@ -54,6 +54,9 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "blocks": {"elementary", "moments", "pairs"},
     "stack": {"blocks", "elementary", "moments", "pairs", "streams", "systems"},
     "prediction": {"errors", "moments", "orbits", "photometry", "response", "systems"},
+    "galaxies": {"errors", "units"},
+    "shear": {"errors", "galaxies", "moments", "prediction", "shapes"},
+    "deconvolution": {"galaxies", "moments", "psf", "shear"},
     "config": {"errors", "multiplicity", "photometry"},
     "sample": {"catalogs", "config", "errors", "galaxy", "stars", "systems"},
     "simulation": {
@@ -75,6 +78,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
 }  # fmt: skip
 NEVER_REACHED = {  # followed through every module in between
     "prediction": {"stack", "simulation"},
+    "deconvolution": {"stack", "simulation"},
     "images": {"response", "weighted", "stack", "prediction"},
     "stack": {"prediction", "response", "psf"},
     "figures": {"prediction", "stack", "simulation", "summary"},
