@@ -25,6 +25,18 @@ def test_quadrature_over_orientations_is_exact_for_powers(projection):
 
 
 @pytest.mark.parametrize("projection", MEAN_SQUARE)
+def test_nodes_on_either_side_of_a_kink(projection):
+    kink = np.array([0.2, 0.7, 1.0])
+    factor, weight = projection_nodes(projection, kink)
+    u = (np.arange(1000) + 0.5) / 1000
+    sine = np.sin(0.5 * np.pi * u)
+    m = np.outer(sine, sine).ravel() if projection != "isotropic" else (np.arange(1_000_000) + 0.5) / 1e6
+    for k, f, w in zip(kink, factor, weight, strict=True):
+        expected = np.minimum(np.sqrt(1 - m**2), k).mean()
+        assert np.minimum(f, k) @ w == pytest.approx(expected, rel=3e-6)
+
+
+@pytest.mark.parametrize("projection", MEAN_SQUARE)
 def test_quadrature_resolves_a_cut(projection):
     # share of orbits whose projection is below rho, smoothed over 0.2 dex as the log-normal does
     factor, weight = projection_nodes(projection)

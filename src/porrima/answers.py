@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import warnings
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ import yaml
 from porrima.config import PopulationConfig, parse
 from porrima.errors import InputError
 from porrima.gaia import fetch_cone
-from porrima.prediction import QUANTITIES, integrate, population_moments, predict
+from porrima.prediction import QUANTITIES, SeriesWarning, integrate, population_moments, predict
 from porrima.sample import draw_stars, population_of
 
 if TYPE_CHECKING:
@@ -153,10 +154,17 @@ def predicted(
     population = population_of(config, draw_stars(config))
     fraction = None if binary_fraction is None else np.array([binary_fraction])
     moments = population_moments(population, integrate(population), fraction)
-    prediction = predict(moments, reply, n_stars)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", SeriesWarning)
+        prediction = predict(moments, reply, n_stars)
     if np.any(np.isnan(prediction.bias)):
-        rule = "is too wide for the kernel moments of this PSF: use --estimator plain, or simulate --method images"
+        rule = (
+            "is too wide for the kernel moments of this PSF, whose expansion stops being good at order "
+            f"{prediction.last_order[0]}: use --estimator plain, or simulate --method images"
+        )
         raise InputError(rule, key="--cut", value=config.cut)
+    for warning in said:
+        warnings.warn(warning.message, stacklevel=2)
     errors = {
         f"{name}_{quantity}": value
         for name in ("bias", "sigma", "sd")

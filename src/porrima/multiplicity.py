@@ -164,6 +164,22 @@ class DucheneKraus2013:
         """Least and largest mass of a primary, in M_sun; KCM16 give no widths above 1.5."""
         return (0.0, 1.5)
 
+    def rows(self, mass: FloatArray) -> NDArray[np.int64]:
+        """Row of the table that each primary takes, the masses between rows by the gap rule.
+
+        Parameters
+        ----------
+        mass : (n,) float array
+            Mass of the primary, in M_sun.
+
+        Returns
+        -------
+        row : (n,) int array
+            0 below 0.1 M_sun, 1 for 0.1-0.5, 2 for solar-type stars.
+        """
+        solar_from = _SOLAR.mass_lo if self.gap_rule == "lower" else _LOW.mass_hi
+        return np.where(mass < _VERY_LOW.mass_hi, 0, np.where(mass < solar_from, 1, 2))
+
     def companions(self, mass: FloatArray) -> CompanionLaw:
         r"""Companion statistics of each primary.
 
@@ -183,9 +199,7 @@ class DucheneKraus2013:
             If a mass lies outside `mass_range`.
         """
         check_masses(mass, self.mass_range, "Duchene & Kraus (2013)")
-        solar_from = _SOLAR.mass_lo if self.gap_rule == "lower" else _LOW.mass_hi
-        row = np.where(mass < _VERY_LOW.mass_hi, 0, np.where(mass < solar_from, 1, 2))
-        table = np.array([_VERY_LOW, _LOW, _SOLAR])[row]
+        table = np.array([_VERY_LOW, _LOW, _SOLAR])[self.rows(mass)]
         log_a = np.log10(table[:, 4])
         beyond = math.inf if self.a_max_factor is None else math.log10(self.a_max_factor)
         return CompanionLaw(

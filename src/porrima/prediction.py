@@ -1,101 +1,48 @@
 """The closed forms: what companions do to the PSF of a stack, without drawing anything.
 
-Moments of the companions are integrated over stars, mass ratio, separation and orientation; a response turns
-them into the bias and the scatter of the measured shape, for any number of stars in the stack.
+Averages over the stars' companions and a response give the bias and the scatter of the measured shape, for any
+number of stars in the stack.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.special import log_ndtr, logsumexp
 
-from porrima.errors import InputError
-from porrima.moments import INDICES, N_MOMENTS, ORDER, angular_mean, pair_coefficient
-from porrima.orbits import projection_nodes
-from porrima.photometry import flux_ratio
+from porrima.averages import PopulationMoments, population_moments
+from porrima.integrals import EVEN, PairIntegrals, integrate
+from porrima.moments import INDICES, ORDER
 from porrima.response import SERIES_LIMIT
+from porrima.singles import added_to_shape, node_weights
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from porrima.response import Response
-    from porrima.systems import Population
+    from porrima.singles import AddedShape
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["PairIntegrals", "PopulationMoments", "Prediction", "integrate", "population_moments", "predict"]
+__all__ = [
+    "QUANTITIES", "PairIntegrals", "PopulationMoments", "Prediction", "SeriesWarning", "integrate",
+    "population_moments", "predict", "series_orders",
+]  # fmt: skip
 
 QUANTITIES = ("e1", "e2", "r2")
 """What is predicted, in the order of every array of three; r2 relative to that of the PSF."""
 
-_EVEN = tuple(range(2, ORDER + 1, 2))
-_PRODUCTS = tuple((n, m) for n in range(2, ORDER + 1) for m in range(n, ORDER + 1) if (n + m) % 2 == 0)
-_TAIL = np.array([a + b == ORDER for a, b in INDICES])
-_CHUNK = 4096  # stars integrated at a time
-_MASS_RATIO_PANELS = 48
-_DISTANCE_STEP = 0.004  # dex
-_LEAST_KEPT = 1e-6  # share of the stars that must be left once resolved pairs are gone
+MANY_STARS = 10_000
+"""Number of stars from which second order about the mean stack is as good as single stars solved exactly."""
+
+_ORDERS = np.sum(INDICES, axis=1)
+_NO_BIAS = 1e-12  # what is smaller is the rounding of a bias that symmetry forbids
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairIntegrals:
-    r"""Expectations over the companion of each of n stars, given that it has one.
-
-    Parameters
-    ----------
-    unresolved : (n,) float array
-        Probability that the pair is closer than the cut, in [0, 1].
-    mean : (n, 4) float array
-        :math:`E[c_n(f)\, r^n;\ r < r_{cut}]` for the even orders 2 to 8, in arcsec^n.
-    product : (n, n_product) float array
-        :math:`E[c_n c_m\, r^{n+m};\ r < r_{cut}]` for n + m even, in arcsec^(n+m).
-    """
-
-    unresolved: FloatArray
-    mean: FloatArray
-    product: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PopulationMoments:
-    r"""First and second moments of the kernel of one star of a stack, for k binary fractions.
-
-    Parameters
-    ----------
-    binary_fraction : (k,) float array
-        Before resolved pairs leave, in [0, 1].
-    unresolved_fraction : (k,) float array
-        Share of pairs among the stars of the stack, in [0, 1].
-    removed_fraction : (k,) float array
-        Share of resolved pairs among all pairs, in [0, 1].
-    mean_x : (k,) float array
-        :math:`\langle x \rangle = \langle f r^2/(1+f)^2 \rangle` with the weights of the stack, in arcsec².
-    mean_x2 : (k,) float array
-        :math:`\langle x^2 \rangle`, likewise, in arcsec⁴.
-    effective_share : (k,) float array
-        Effective number of stars over the number in the stack, (0, 1]; 1 for equal weights.
-    mean : (k, n_moment) float array
-        Mean kernel moments of an endless stack in the order of `moments.INDICES`, in arcsec^(a+b).
-    shift : (k, n_moment) float array
-        N times the difference from it of the mean over stacks of N stars; 0 for equal weights.
-    covariance : (k, n_moment, n_moment) float array
-        N times the covariance of the moments of stacks of N stars.
-    """
-
-    binary_fraction: FloatArray
-    unresolved_fraction: FloatArray
-    removed_fraction: FloatArray
-    mean_x: FloatArray
-    mean_x2: FloatArray
-    effective_share: FloatArray
-    mean: FloatArray
-    shift: FloatArray
-    covariance: FloatArray
+class SeriesWarning(UserWarning):
+    """Pairs are too wide, for this PSF and estimator, for a series in kernel moments."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,16 +59,32 @@ class Prediction:
         Size of the PSF without companions by the same estimator, in arcsec².
     bias : (3, k) float array
         Mean of e1, e2, r2 of the stack minus those of the PSF; r2 over that of the PSF.  Dimensionless.
-        Bias and sd are NaN where the pairs are too wide for a series in kernel moments, see `predict`.
-    sd : (3, k) float array
-        Standard deviation about the mean, dimensionless.
+        Bias and covariance are NaN where the pairs are too wide for a series in kernel moments, see `predict`.
+    covariance : (3, 3, k) float array
+        Covariance of the three about their means, dimensionless.
+    log_covariance : (3, 3, k) float array
+        Covariance of e1, e2 and ln R² about their means, dimensionless.
+    crossover_n_stars : (3, k) float array
+        Number of stars at which the bias overtakes the scatter: below 1 where it always does, infinite where there
+        is no bias (count).
+    series : (4, k) float array
+        Share of the orders 2, 4, 6 and 8 of the kernel moments in the mean change of size, dimensionless.
     """
 
     population: PopulationMoments
     n_stars: int | None
     r2_0: float
     bias: FloatArray
-    sd: FloatArray
+    covariance: FloatArray
+    log_covariance: FloatArray
+    crossover_n_stars: FloatArray
+    series: FloatArray
+
+    @property
+    def sd(self) -> FloatArray:
+        """Standard deviation about the mean, (3, k), dimensionless."""
+        variance: FloatArray = np.einsum("qqk->qk", self.covariance)
+        return np.sqrt(np.maximum(variance, 0.0))
 
     @property
     def sigma(self) -> FloatArray:
@@ -133,213 +96,28 @@ class Prediction:
         """Mean of x over the size of the PSF, (k,), dimensionless."""
         return self.population.mean_x / self.r2_0
 
+    @property
+    def last_order(self) -> NDArray[np.int64]:
+        """Order at which the expansion stops being good: the first whose successor is no smaller, or 8; (k,)."""
+        grows = np.abs(self.series[1:]) >= np.abs(self.series[:-1])
+        return np.where(grows.any(axis=0), np.array(EVEN)[np.argmax(grows, axis=0)], ORDER)
 
-def integrate(population: Population) -> PairIntegrals:
-    r"""Expectations over companions by quadrature: mass ratio and orientation by Gauss's rule, separation exactly.
 
-    Parameters
-    ----------
-    population : Population
-        Stars, their companions' law and the cut.
+class _Derivatives(NamedTuple):
+    """First (4, n_moment) and second (4, n_moment, n_moment) derivative of e1, e2, R² over R0² and ln R²."""
 
-    Returns
-    -------
-    integrals : PairIntegrals
-        One row per star, in arcsec^n.
+    first: FloatArray
+    second: FloatArray
 
-    Notes
-    -----
-    For one orientation the projected separation is :math:`\rho a / d`, and the partial moments of a
-    log-normal a with :math:`\mu, s` in natural logarithms are
-    :math:`E[a^k; a < A] = \exp(k\mu + k^2 s^2/2)\, \Phi((\ln A - \mu)/s - k s)`.
-    Mass ratio and separation are independent in the models at hand.
-    """
-    separations = _separation_moments(population)
-    c_mean, c_product = (
-        np.concatenate(parts)
-        for parts in zip(
-            *(
-                _coefficient_moments(population, slice(first, first + _CHUNK))
-                for first in range(0, len(population.stars), _CHUNK)
-            ),
-            strict=True,
+    @classmethod
+    def of(cls, response: Response) -> _Derivatives:
+        """Those of a response."""
+        r2_0 = float(response.shape0.r2)
+        size, curved = response.first[2:] / r2_0, response.second[2:] / r2_0
+        return cls(
+            first=np.concatenate([response.first[:2], size, size]),
+            second=np.concatenate([response.second[:2], curved, curved - size.T @ size]),
         )
-    )
-    return PairIntegrals(
-        unresolved=separations[0],
-        mean=c_mean * np.stack([separations[n] for n in _EVEN], axis=1),
-        product=c_product * np.stack([separations[n + m] for n, m in _PRODUCTS], axis=1),
-    )
-
-
-def _coefficient_moments(population: Population, some: slice) -> tuple[FloatArray, FloatArray]:
-    """E[c_n] for even n, and E[c_n c_m], of some stars."""
-    f, weight = _flux_ratio_nodes(population, some)
-    c = {n: pair_coefficient(f, n) for n in range(2, ORDER + 1)}
-    mean = [np.sum(weight * c[n], axis=1) for n in _EVEN]
-    product = [np.sum(weight * c[n] * c[m], axis=1) for n, m in _PRODUCTS]
-    return np.stack(mean, axis=1), np.stack(product, axis=1)
-
-
-def _separation_moments(population: Population) -> dict[int, FloatArray]:
-    """E[r^k; r < cut] of each star for even k from 0 to twice the order, in arcsec^k.
-
-    They depend on the star through its law and distance alone, so they are found on a fine grid of distances
-    and interpolated (cubic, in logarithms).
-    """
-    law = np.stack([population.law.log_a, population.law.log_a_sigma, population.law.log_a_max], axis=1)
-    log_distance = np.log10(population.stars.distance)
-    n = max(5, 2 + int(np.ptp(log_distance) / _DISTANCE_STEP))
-    grid = np.linspace(log_distance.min() - _DISTANCE_STEP, log_distance.max() + _DISTANCE_STEP, n)
-    moments = {k: np.empty(log_distance.size) for k in range(0, 2 * ORDER + 1, 2)}
-    laws, which = np.unique(law, axis=0, return_inverse=True)
-    for number, one in enumerate(laws):
-        mine = which.ravel() == number
-        for k, log_moment in _log_separation_moments(population, one, grid).items():
-            moments[k][mine] = np.exp(CubicSpline(grid, log_moment)(log_distance[mine]))
-    return moments
-
-
-def _log_separation_moments(
-    population: Population, law: FloatArray, log_distance: FloatArray
-) -> dict[int, FloatArray]:
-    """Log of E[r^k; r < cut] for one law of the semi-major axis at each log10 distance."""
-    rho, weight = projection_nodes(population.projection)
-    mu, s, largest = law * math.log(10)
-    log_d = log_distance[:, None] * math.log(10)
-    upper = np.minimum(math.log(population.cut) + log_d - np.log(rho), largest)
-    z = (upper - mu) / s
-    log_norm = log_ndtr((largest - mu) / s)
-    moments = {}
-    for k in range(0, 2 * ORDER + 1, 2):
-        log_partial = k * (mu - log_d + np.log(rho)) + 0.5 * (k * s) ** 2 + log_ndtr(z - k * s) - log_norm
-        moments[k] = logsumexp(log_partial, axis=1, b=weight)
-    return moments
-
-
-def _flux_ratio_nodes(population: Population, some: slice) -> tuple[FloatArray, FloatArray]:
-    """Flux ratios at the nodes of the mass ratio, and their weights, both (n, node)."""
-    law, mass = population.law, population.stars.mass[some]
-    q_min, gamma = law.mass_ratio_min[some, None], law.mass_ratio_exponent[some, None]
-    bright = np.clip(population.tracks.dark_below / mass[:, None], q_min, 1.0)  # below it f = 0
-    x, w = np.polynomial.legendre.leggauss(2)
-    panel = (np.arange(_MASS_RATIO_PANELS)[:, None] + 0.5 * (x + 1)) / _MASS_RATIO_PANELS
-    panel_weight = np.tile(0.5 * w / _MASS_RATIO_PANELS, _MASS_RATIO_PANELS)
-    span = -np.log(bright)  # uniform panels in log q, as the tracks are piecewise linear in log mass
-    q = np.minimum(bright * np.exp(span * panel.ravel()), 1.0)
-    g = gamma + 1
-    power = np.where(np.abs(g) > 1e-9, g, 1.0)
-    norm = np.where(np.abs(g) > 1e-9, (1 - q_min**power) / power, -np.log(q_min))
-    tracks = population.tracks
-    some_tracks = replace(tracks, index=tracks.index[some], weight=tracks.weight[some])
-    weight = panel_weight * span * q**g / norm
-    given = ~np.isnan(law.mass_ratio[some])
-    q[given], weight[given] = law.mass_ratio[some][given, None], 1.0 / q.shape[1]
-    f = flux_ratio(some_tracks, mass, q)
-    return np.where((span > 0) | given[:, None], f, 0.0), weight
-
-
-def population_moments(
-    population: Population, integrals: PairIntegrals, binary_fraction: FloatArray | None = None
-) -> PopulationMoments:
-    r"""Kernel moments of one star of a stack at given binary fractions, resolved pairs removed.
-
-    Parameters
-    ----------
-    population : Population
-        The n stars.
-    integrals : PairIntegrals
-        Of the same stars, from `integrate`.
-    binary_fraction : (k,) float array, optional
-        Before resolved pairs leave, in [0, 1]; None for the model's own.
-
-    Returns
-    -------
-    moments : PopulationMoments
-        For each fraction, in arcsec^(a+b).
-
-    Raises
-    ------
-    InputError
-        If nearly all stars are resolved pairs.
-
-    Notes
-    -----
-    With :math:`p_i = \min(1, s\, MF_i)`,
-    :math:`\langle x^k \rangle = \sum_i p_i E[x^k; r < r_{cut}]_i / \sum_i (1 - p_i P_{res,i})`.  With weights w a
-    stack's moments are the ratio :math:`\sum w k / \sum w`: to first order in 1/N their mean is
-    :math:`m - [\langle w^2 k\rangle - m \langle w^2\rangle] / (N \langle w\rangle^2)`, their covariance
-    :math:`\langle w^2 (k - m)(k' - m')\rangle / (N \langle w\rangle^2)`, and the effective number is
-    :math:`N \langle w\rangle^2/\langle w^2\rangle`.  Exact for equal weights.
-    """
-    fraction, w = population.law.multiplicity_fraction, population.weight
-    scale = population.scale(binary_fraction)
-    order = np.argsort(fraction, kind="stable")
-    resolved = 1 - integrals.unresolved
-    columns = np.column_stack(
-        [
-            np.ones(fraction.size), resolved, w * resolved, w**2 * resolved,
-            w[:, None] * integrals.mean, w * integrals.product[:, 0],
-            w[:, None] ** 2 * integrals.mean, w[:, None] ** 2 * integrals.product,
-        ]
-    )[order]  # fmt: skip
-    sums = _weighted_sums(fraction[order], columns, scale)
-    pairs, resolved_pairs = sums[:, 0], sums[:, 1]
-    kept = fraction.size - resolved_pairs
-    if np.any(kept < _LEAST_KEPT * fraction.size):
-        raise InputError(
-            "must leave some pairs unresolved at this binary fraction", key="cut", value=population.cut
-        )
-    mean_w, mean_w2 = (w.sum() - sums[:, 2]) / kept, ((w**2).sum() - sums[:, 3]) / kept
-    first, x2, second, product = np.split(sums[:, 4:], np.cumsum([4, 1, 4]), axis=1)
-    mean = _isotropic_means(first / (kept * mean_w)[:, None])
-    weighted = _isotropic_means(second / (kept * mean_w**2)[:, None])
-    spread = (mean_w2 / mean_w**2)[:, None]
-    covariance = _isotropic_products(product / (kept * mean_w**2)[:, None])
-    covariance -= mean[:, :, None] * weighted[:, None, :] + weighted[:, :, None] * mean[:, None, :]
-    covariance += spread[:, :, None] * mean[:, :, None] * mean[:, None, :]
-    return PopulationMoments(
-        binary_fraction=pairs / fraction.size,
-        unresolved_fraction=(pairs - resolved_pairs) / kept,
-        removed_fraction=np.divide(resolved_pairs, pairs, out=np.zeros_like(pairs), where=pairs > 0),
-        mean_x=first[:, 0] / (kept * mean_w),
-        mean_x2=x2[:, 0] / (kept * mean_w),
-        effective_share=1 / spread[:, 0],
-        mean=mean,
-        shift=spread * mean - weighted,
-        covariance=covariance,
-    )
-
-
-def _weighted_sums(fraction: FloatArray, columns: FloatArray, scale: FloatArray) -> FloatArray:
-    """Sums over stars of min(1, s fraction) times each column, (k, column); fractions ascend."""
-    zero = np.zeros((1, columns.shape[1]))
-    scaled = np.concatenate([zero, np.cumsum(fraction[:, None] * columns, axis=0)])
-    plain = np.concatenate([zero, np.cumsum(columns, axis=0)])
-    with np.errstate(divide="ignore"):
-        below = np.searchsorted(fraction, 1.0 / scale)
-    sums: FloatArray = scale[:, None] * scaled[below] + plain[-1] - plain[below]
-    return sums
-
-
-def _isotropic_means(of_order: FloatArray) -> FloatArray:
-    """Mean moments (k, n_moment) of kernels turned at random, from those of even order (k, 4)."""
-    mean = np.zeros((of_order.shape[0], N_MOMENTS))
-    for i, (a, b) in enumerate(INDICES):
-        if (a + b) % 2 == 0:
-            mean[:, i] = of_order[:, _EVEN.index(a + b)] * angular_mean(a, b)
-    return mean
-
-
-def _isotropic_products(of_orders: FloatArray) -> FloatArray:
-    """Mean products of moments (k, n_moment, n_moment) of kernels turned at random, from (k, n_product)."""
-    second = np.zeros((of_orders.shape[0], N_MOMENTS, N_MOMENTS))
-    for i, (a, b) in enumerate(INDICES):
-        for j, (c, d) in enumerate(INDICES):
-            n, m = sorted((a + b, c + d))
-            if (n + m) % 2 == 0:
-                second[:, i, j] = of_orders[:, _PRODUCTS.index((n, m))] * angular_mean(a + c, b + d)
-    return second
 
 
 def predict(moments: PopulationMoments, response: Response, n_stars: int | None = None) -> Prediction:
@@ -364,19 +142,32 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
     ValueError
         If `n_stars` is less than 1.
 
+    Warns
+    -----
+    SeriesWarning
+        Where the series in kernel moments does not converge: with the order at which it stops being good.
+
     Notes
     -----
-    With the mean m and covariance C/N of a stack's moments and the response's derivatives A and B,
-    bias = A m + (m B m + tr(B C)/N)/2 and sd² = (A + B m) C (A + B m)/N.  For plain moments this is
+    The change of shape of a stack is what each star adds alone, :math:`s_1(k/N) = s(k/N) - s_0`, solved exactly, and
+    to second order what two stars add together, :math:`k^T B k'/N^2` with the response's second derivative B.
+    With the mean m and covariance C of one star's moments and :math:`g = s_1(k/N) + \frac{N-1}{N^2} m^T B k`,
+
+    .. math:: \mathrm{bias} = N \langle s_1 \rangle + \frac12\Big(1 - \frac1N\Big) m^T B m, \qquad
+       \mathrm{cov}_{qr} = N\, \mathrm{cov}(g_q, g_r) + \frac{N-1}{2N^3} \mathrm{tr}(B_q C B_r C) .
+
+    This is exact for one star, and what three stars add together, third order in the size change, is left out.
+    From `MANY_STARS` on, and for stars of unequal weight, :math:`s_1` too is taken to second order: then with the
+    first derivative A, bias = A m + (m B m + tr(B C)/N)/2 and the covariance is that of (A + B m) k with the same
+    trace.  For plain moments, to first order,
 
     .. math:: sd(R^2)/R_0^2 = \sqrt{(\langle x^2\rangle - \langle x\rangle^2)/N}/R_0^2, \qquad
        sd(e_i) = \sqrt{[\langle x^2\rangle/2 + e_i^2(\langle x^2\rangle - \langle x\rangle^2)]/N}/R_0^2,
 
-    the first exact, the second to first order in x/R0² (6 % too large at N = 1, 0.9 % at 5), and for
-    N → ∞ KCM16 Eqs. 7-12 with their second-order term.  For other estimators sd is first order about the
-    mean, with the same reservation at very small N.  Where the moments of order 8 make up more than
-    `response.SERIES_LIMIT` of the mean size change, the series has not converged and the result is NaN:
-    a cut near the width of the PSF.  Plain moments have no such limit.
+    the first exact, the second 6 % too large at N = 1 and 1 % at 5, and for N → ∞ KCM16 Eqs. 7-12 with their
+    second-order term.  Where the moments of order 8 make up more than `response.SERIES_LIMIT` of the mean size
+    change, the series has not converged and the result is NaN: a cut near the width of the PSF.  Plain moments have
+    no such limit.
 
     References
     ----------
@@ -384,17 +175,130 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
     """
     if n_stars is not None and n_stars < 1:
         raise ValueError(f"n_stars must be at least 1, got {n_stars}")
-    per_stack = 0.0 if n_stars is None else 1.0 / n_stars
-    first, second = response.first, response.second
-    m, c = moments.mean + moments.shift * per_stack, moments.covariance * per_stack
-    bending = np.einsum("ki,qij->qkj", m, second)
-    bias = first @ m.T + 0.5 * (np.einsum("qkj,kj->qk", bending, m) + np.einsum("qij,kij->qk", second, c))
-    gradient = first[:, None, :] + bending
-    variance = np.einsum("qki,kij,qkj->qk", gradient, c, gradient, optimize=True)
-    r2_0 = float(response.shape0.r2)
-    size, tail = m @ first[2], m[:, _TAIL] @ first[2, _TAIL]
-    diverged = np.abs(tail) > SERIES_LIMIT * np.abs(size)
-    bias[:, diverged], variance[:, diverged] = np.nan, np.nan
-    unit = np.array([1.0, 1.0, r2_0])[:, None]
-    sd = np.sqrt(np.maximum(variance, 0.0))
-    return Prediction(population=moments, n_stars=n_stars, r2_0=r2_0, bias=bias / unit, sd=sd / unit)
+    by_moments = _Derivatives.of(response)
+    n_too_wide = 0
+    limit, scatter = _endless(moments, by_moments)
+    if n_stars is None:
+        bias, covariance = limit, np.zeros((4, 4, limit.shape[1]))
+    elif n_stars >= MANY_STARS or not moments.equal_weights:
+        bias, covariance = _about_the_mean(moments, by_moments, n_stars)
+    else:
+        added = added_to_shape(response, moments.cut, n_stars)
+        n_too_wide = added.n_too_wide
+        bias, covariance = _star_by_star(moments, by_moments, n_stars, added)
+    biased = np.abs(limit) > _NO_BIAS
+    crossover = np.divide(scatter, limit**2, out=np.full_like(scatter, np.inf), where=biased)
+    orders = series_orders(moments, response)
+    diverged = np.abs(orders[-1]) > SERIES_LIMIT
+    for result in (bias, covariance, crossover):
+        result[..., diverged] = np.nan
+    logarithmic = [0, 1, 3]
+    prediction = Prediction(
+        population=moments,
+        n_stars=n_stars,
+        r2_0=float(response.shape0.r2),
+        bias=bias[:3],
+        covariance=covariance[:3, :3],
+        log_covariance=covariance[np.ix_(logarithmic, logarithmic)],
+        crossover_n_stars=crossover[:3],
+        series=orders,
+    )
+    if np.any(diverged):
+        text = _series_text(prediction, response, int(np.argmax(diverged)))
+        warnings.warn(text, SeriesWarning, stacklevel=2)
+    elif n_too_wide and np.any(moments.unresolved_fraction > 0):
+        text = (
+            f"cut {moments.cut} arcsec: single pairs near it are too wide for {response.psf} ({response.estimator}) "
+            f"at n_stars = {n_stars} and are taken to second order"
+        )
+        warnings.warn(text, SeriesWarning, stacklevel=2)
+    return prediction
+
+
+def _endless(moments: PopulationMoments, by_moments: _Derivatives) -> tuple[FloatArray, FloatArray]:
+    """Change of shape of an endless stack, and N times the variance of a long one, both (4, k)."""
+    bending = _bending(by_moments, moments.mean)
+    bias = by_moments.first @ moments.mean.T + 0.5 * np.einsum("kqi,ki->qk", bending, moments.mean)
+    gradient = by_moments.first + bending
+    return bias, np.einsum("kqi,kqi->qk", gradient @ moments.covariance, gradient)
+
+
+def _about_the_mean(
+    moments: PopulationMoments, by_moments: _Derivatives, n_stars: int
+) -> tuple[FloatArray, FloatArray]:
+    """Change of shape (4, k) and covariance (4, 4, k) to second order about the mean stack."""
+    m, c = moments.mean + moments.shift / n_stars, moments.covariance / n_stars
+    bending = _bending(by_moments, m)
+    curved = np.einsum("kqi,ki->qk", bending, m) + np.einsum("qij,kij->qk", by_moments.second, c)
+    gradient = by_moments.first + bending
+    covariance = gradient @ c @ gradient.transpose(0, 2, 1) + 0.5 * _traces(by_moments, c)
+    return by_moments.first @ m.T + 0.5 * curved, covariance.transpose(1, 2, 0)
+
+
+def _bending(by_moments: _Derivatives, mean: FloatArray) -> FloatArray:
+    """Second derivatives times mean moments, (k, 4, n_moment)."""
+    bending: FloatArray = mean @ by_moments.second.reshape(-1, mean.shape[1]).T
+    return bending.reshape(mean.shape[0], -1, mean.shape[1])
+
+
+def _traces(by_moments: _Derivatives, covariance: FloatArray) -> FloatArray:
+    """tr(B_q C B_r C), (k, 4, 4)."""
+    turned = by_moments.second @ covariance[:, None]
+    k, q = turned.shape[:2]
+    traces: FloatArray = turned.reshape(k, q, -1) @ turned.transpose(0, 3, 2, 1).reshape(k, -1, q)
+    return traces
+
+
+def _star_by_star(
+    moments: PopulationMoments, by_moments: _Derivatives, n_stars: int, added: AddedShape
+) -> tuple[FloatArray, FloatArray]:
+    """Change of shape (4, k) and covariance (4, 4, k), exact in what a single star adds."""
+    weight, m, c = node_weights(moments.powers), moments.mean, moments.covariance
+
+    def average(values: FloatArray) -> FloatArray:
+        return (weight @ values.reshape(values.shape[0], -1)).reshape(-1, *values.shape[1:])
+
+    bending = _bending(by_moments, m)
+    alone = average(added.mean)
+    bias = n_stars * alone + 0.5 * (1 - 1 / n_stars) * np.einsum("kqi,ki->kq", bending, m)
+    push = bending * (n_stars - 1) / n_stars**2  # on a star's moments, from the others
+    pulled = push.transpose(0, 2, 1)
+    mixed = average(added.with_moments) @ pulled
+    square = average(added.product) + mixed + mixed.transpose(0, 2, 1)
+    square += push @ (c + m[:, :, None] * m[:, None, :]) @ pulled
+    mean = alone + np.einsum("kqi,ki->kq", push, m)
+    covariance = n_stars * (square - mean[:, :, None] * mean[:, None, :])
+    covariance += 0.5 * (n_stars - 1) / n_stars**3 * _traces(by_moments, c)
+    return bias.T, covariance.transpose(1, 2, 0)
+
+
+def series_orders(moments: PopulationMoments, response: Response) -> FloatArray:
+    """Share of each even order of the kernel moments in the mean change of size.
+
+    Parameters
+    ----------
+    moments : PopulationMoments
+        Of one star, at k binary fractions.
+    response : Response
+        Of the PSF and estimator.
+
+    Returns
+    -------
+    share : (4, k) float array
+        Orders 2, 4, 6 and 8, with sum 1, dimensionless; 0 where there is no change.
+    """
+    size = response.first[2] * moments.mean
+    total = size.sum(axis=1)
+    parts = np.stack([size[:, n == _ORDERS].sum(axis=1) for n in EVEN])
+    share: FloatArray = np.divide(parts, total, out=np.zeros_like(parts), where=total != 0)
+    return share
+
+
+def _series_text(prediction: Prediction, response: Response, k: int) -> str:
+    """What is wrong with a series that does not converge."""
+    shown = ", ".join(f"{100 * part:+.3g} %" for part in prediction.series[:, k])
+    return (
+        f"cut {prediction.population.cut} arcsec is too wide for the kernel moments of {response.psf} "
+        f"({response.estimator}): orders {', '.join(map(str, EVEN))} make {shown} of the size change, and the "
+        f"expansion stops being good at order {prediction.last_order[k]}"
+    )

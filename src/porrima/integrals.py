@@ -1,0 +1,320 @@
+r"""Expectations over the companion of each star, without drawing any: powers of y and of the separation.
+
+An even kernel moment of a pair is a polynomial in :math:`y = c_2 = f/(1+f)^2` times a power of its separation,
+and so is every product of moments of even total order.  Mass ratio and separation are independent in the models
+at hand, so the expectations :math:`E[y^j]` and :math:`E[r^{2k};\ r < r_{cut}]` say all.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit, prange
+from scipy.interpolate import CubicSpline
+from scipy.special import log_ndtr, logsumexp
+
+from porrima.moments import ORDER
+from porrima.orbits import projection_nodes
+from porrima.photometry import magnitude_on_track
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from porrima.orbits import Projection
+    from porrima.systems import Population
+
+    FloatArray = NDArray[np.float64]
+
+__all__ = ["EVEN", "PRODUCTS", "PairIntegrals", "coefficient_polynomial", "integrate", "separation_moments"]
+
+EVEN = tuple(range(2, ORDER + 1, 2))
+"""Orders of the moments that do not vanish in the mean."""
+
+PRODUCTS = tuple((n, m) for n in range(2, ORDER + 1) for m in range(n, ORDER + 1) if (n + m) % 2 == 0)
+"""Pairs of orders whose products do not vanish in the mean."""
+
+_INTERVALS = 128  # of Simpson's rule over the logarithm of the mass ratio; the coarse rule takes half as many
+_STEP = 0.02  # dex of cut times distance over semi-major axis; the coarse rule takes twice as much
+_LEAST = 1e-300  # so that a share which is 0 has a logarithm
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairIntegrals:
+    r"""Expectations over the companion of each of n stars, given that it has one.
+
+    Parameters
+    ----------
+    cut : float
+        Separation from which a pair is resolved, in arcsec.
+    coefficient : (2, n, 9) float array
+        :math:`E[(4y)^j]` for j = 0 to 8, dimensionless: by the rule in use, and by one of half its nodes.
+    separation : (2, n, 9) float array
+        :math:`E[(r/r_{cut})^{2k};\ r < r_{cut}]` for k = 0 to 8, dimensionless, likewise.
+    """
+
+    cut: float
+    coefficient: FloatArray
+    separation: FloatArray
+
+    @property
+    def unresolved(self) -> FloatArray:
+        """Probability that the pair is closer than the cut, (n,), in [0, 1]."""
+        probability: FloatArray = self.separation[0, :, 0]
+        return probability
+
+    @property
+    def mean(self) -> FloatArray:
+        r""":math:`E[c_n r^n;\ r < r_{cut}]` for the even orders 2 to 8, (n, 4), in arcsec^n."""
+        return self._of([(n, coefficient_polynomial(n)) for n in EVEN])
+
+    @property
+    def product(self) -> FloatArray:
+        r""":math:`E[c_n c_m r^{n+m};\ r < r_{cut}]` for `PRODUCTS`, (n, n_product), in arcsec^(n+m)."""
+        return self._of([(n + m, coefficient_polynomial(n, m)) for n, m in PRODUCTS])
+
+    def _of(self, terms: list[tuple[int, FloatArray]]) -> FloatArray:
+        """Expectation of some polynomials in 4 y, each times a power of r."""
+        columns = [(self.coefficient[0] @ c) * self.separation[0, :, n // 2] * self.cut**n for n, c in terms]
+        return np.stack(columns, axis=1)
+
+
+def coefficient_polynomial(n: int, m: int = 0) -> FloatArray:
+    r"""Coefficients that make :math:`c_n`, or :math:`c_n c_m`, of powers of 4 y.
+
+    Parameters
+    ----------
+    n, m : int
+        Orders of the moments, 2 to 8 and even in sum; m = 0 for one moment.
+
+    Returns
+    -------
+    polynomial : (9,) float array
+        Factor of :math:`(4y)^j`, j from 0 to 8, dimensionless.
+
+    Notes
+    -----
+    With the shares p = 1/(1+f) and 1 - p of the flux, y = p (1 - p).  For even n,
+    :math:`c_n = y S_{n-1}` with the sums of powers :math:`S_k = S_{k-1} - y S_{k-2}`, :math:`S_0 = 2, S_1 = 1`;
+    for odd n, :math:`c_n = y \sqrt{1-4y}\, D_{n-1}` with :math:`D_k = D_{k-1} - y D_{k-2}`,
+    :math:`D_0 = 0, D_1 = 1`.  Exact.
+    """
+    y = np.polynomial.Polynomial([0.0, 1.0])
+
+    def recursion(zero: float, k: int) -> np.polynomial.Polynomial:
+        before, now = zero + 0 * y, 1 + 0 * y
+        for _ in range(k - 1):
+            before, now = now, now - y * before
+        return now
+
+    if n % 2 == 0:
+        result = y * recursion(2.0, n - 1) * (y * recursion(2.0, m - 1) if m else 1)
+    else:
+        result = y**2 * (1 - 4 * y) * recursion(0.0, n - 1) * recursion(0.0, m - 1)
+    out = np.zeros(ORDER + 1)
+    found = np.asarray(result.trim().coef, dtype=float)
+    out[: found.size] = found / 4.0 ** np.arange(found.size)
+    return out
+
+
+def integrate(population: Population) -> PairIntegrals:
+    r"""Expectations over companions by quadrature: mass ratio by Simpson's rule, orientation by Gauss's.
+
+    Parameters
+    ----------
+    population : Population
+        Stars, their companions' law and the cut.
+
+    Returns
+    -------
+    integrals : PairIntegrals
+        One row per star, dimensionless, each by two rules, whose difference is the estimate of the error.
+
+    Notes
+    -----
+    Simpson's rule has 128 intervals in the logarithm of the mass ratio, along which tracks are piecewise linear.
+    The separation is exact for one orientation, see `separation_moments`.
+    """
+    return PairIntegrals(
+        cut=population.cut,
+        coefficient=coefficient_moments(population),
+        separation=separation_moments(population),
+    )
+
+
+def coefficient_moments(population: Population, intervals: int = _INTERVALS) -> FloatArray:
+    """Expectation of powers of 4 y over the mass ratio of each star.
+
+    Parameters
+    ----------
+    population : Population
+        Of n stars.
+    intervals : int
+        Of Simpson's rule, a multiple of four (count).
+
+    Returns
+    -------
+    moments : (2, n, 9) float array
+        Powers 0 to 8, dimensionless; by all nodes, and by every other.
+    """
+    law, tracks = population.law, population.tracks
+    moments = np.empty((2, len(population.stars), ORDER + 1))
+    _coefficients(
+        tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index, tracks.weight,
+        population.stars.mass, law.mass_ratio_min, law.mass_ratio_exponent, law.mass_ratio, intervals, moments,
+    )  # fmt: skip
+    return moments
+
+
+@njit(inline="always")
+def _add_powers(weight, flux_ratio, out):  # type: ignore[no-untyped-def]
+    """Weight times each power of 4 y, from the first on, added to a row."""
+    four_y = 4.0 * flux_ratio / (1.0 + flux_ratio) ** 2
+    for j in range(1, out.size):
+        weight *= four_y
+        out[j] += weight
+
+
+@njit(cache=True, parallel=True)
+def _coefficients(  # type: ignore[no-untyped-def]
+    grid, log_mass_min, dark_below, index, weight, mass, q_min, exponent, given, intervals, out
+):
+    """E[(4y)^j] of each star by Simpson's rule in ln q, with all nodes and with every other one."""
+    to_log, to_exponent = 1.0 / math.log(10.0), -0.4 * math.log(10.0)
+    for s in prange(mass.size):
+        i, w, log_mass = index[s], weight[s], math.log10(mass[s])
+        primary = magnitude_on_track(
+            grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
+        )
+        out[:, s, :] = 0.0
+        out[:, s, 0] = 1.0
+        g = exponent[s] + 1.0
+        first = min(max(dark_below / mass[s], q_min[s]), 1.0)  # below it companions are dark
+        span, nodes = -math.log(first), intervals + 1
+        if not math.isnan(given[s]):
+            nodes, span = 1, -math.log(given[s])
+            if given[s] * mass[s] < dark_below:
+                continue
+        elif span == 0.0:
+            continue
+        norm = (1.0 - q_min[s] ** g) / g if abs(g) > 1e-9 else -math.log(q_min[s])
+        h = span / intervals
+        for k in range(nodes):
+            log_q = h * k - span
+            magnitude = magnitude_on_track(
+                grid, log_mass_min, log_mass + log_q * to_log,
+                i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],
+            )  # fmt: skip
+            f = min(math.exp(to_exponent * (magnitude - primary)), 1.0)
+            if nodes == 1:
+                _add_powers(1.0, f, out[0, s])
+                _add_powers(1.0, f, out[1, s])
+                continue
+            end = k == 0 or k == intervals
+            density = math.exp(g * log_q) / norm * h / 3.0
+            _add_powers(density * (1.0 if end else 4.0 if k % 2 else 2.0), f, out[0, s])
+            if k % 2 == 0:
+                _add_powers(density * 2.0 * (1.0 if end else 4.0 if k % 4 else 2.0), f, out[1, s])
+
+
+def separation_moments(population: Population) -> FloatArray:
+    r"""Expectation of even powers of the separation below the cut, over the orbits of each star.
+
+    Parameters
+    ----------
+    population : Population
+        Of n stars.
+
+    Returns
+    -------
+    moments : (2, n, 9) float array
+        :math:`E[(r/r_{cut})^{2k};\ r < r_{cut}]`, k = 0 to 8; by the rule in use and by a coarser one.
+
+    Notes
+    -----
+    For one orientation the projected separation is :math:`\rho a/d`, and the partial moments of a log-normal a
+    with :math:`\mu, s` in natural logarithms are
+    :math:`E[a^k; a < A] = \exp(k\mu + k^2 s^2/2)\, \Phi((\ln A - \mu)/s - k s)`.  What remains depends on the
+    star through :math:`\ln(r_{cut} d/\bar a)` alone: a table of it, for each scatter and truncation, is
+    interpolated (cubic, in logarithms).
+    """
+    out = np.empty((2, len(population.stars), ORDER + 1))
+    law = population.law
+    place = np.log10(population.cut * population.stars.distance) - law.log_a  # of the cut over mean a, dex
+    kinds, which = np.unique(
+        np.stack([law.log_a_sigma, law.log_a_max - law.log_a], axis=1).round(12), axis=0, return_inverse=True
+    )
+    for number, (sigma, beyond) in enumerate(kinds):
+        mine = which.ravel() == number
+        for rule in (0, 1):
+            found = _log_moments(float(sigma), float(beyond), population.projection, place[mine], rule)
+            out[rule, mine] = np.exp(found)
+    return out
+
+
+def _log_moments(
+    sigma: float, beyond: float, projection: Projection, place: FloatArray, rule: int
+) -> FloatArray:
+    """Logarithms of the partial moments (n, 9) where the cut times distance over mean axis is (n,), in dex."""
+    lowest = math.floor(min(place.min(), beyond - _STEP))
+    inside = np.minimum(place, beyond)
+    if math.isinf(beyond):
+        highest, across = float(math.ceil(place.max()) + 1), inside
+    else:
+        highest, across = beyond, np.sqrt(beyond - inside)
+    table = _separation_table(sigma, beyond, projection, lowest, highest, rule)
+    farther = (place - inside)[:, None] * math.log(10)  # where the cut is beyond the widest orbit
+    log_moments: FloatArray = table(across) - 2 * np.arange(ORDER + 1) * farther
+    return log_moments
+
+
+@lru_cache(maxsize=256)
+def _separation_table(
+    sigma: float, beyond: float, projection: Projection, lowest: float, highest: float, rule: int
+) -> CubicSpline:
+    """Logarithms of the partial moments against log10 of cut times distance over the mean semi-major axis.
+
+    Where orbits are truncated, against the root of what is left to the widest, which is smooth up to that one.
+    """
+    step, s, largest = _STEP * (1 + rule), sigma * math.log(10), beyond * math.log(10)
+    n = 2 * math.ceil((highest - lowest) / step / 2) + 1
+    if math.isinf(beyond):
+        node = place = np.linspace(lowest, highest, n)
+        rho, weight = projection_nodes(projection, nodes=64 // (1 + rule))
+    else:
+        node = np.linspace(0.0, math.sqrt(highest - lowest), n)
+        place = highest - node**2
+        kink = np.minimum(10.0 ** (place - beyond), 1.0)
+        rho, weight = projection_nodes(projection, kink, nodes=32 // (1 + rule))
+    reach = place[:, None] * math.log(10) - np.log(rho)  # of ln(a / mean a) at the cut
+    z = np.minimum(reach, largest) / s
+    log_moments = np.empty((place.size, ORDER + 1))
+    for k in range(ORDER + 1):
+        log_partial = -2 * k * reach + 0.5 * (2 * k * s) ** 2 + log_ndtr(z - 2 * k * s)
+        log_moments[:, k] = logsumexp(log_partial, axis=1, b=np.maximum(weight, _LEAST))
+    return CubicSpline(node, log_moments - log_ndtr(largest / s))
+
+
+def separation_share(sigma: float, beyond: float, projection: Projection, place: FloatArray) -> FloatArray:
+    """Probability that a pair is seen closer than a separation.
+
+    Parameters
+    ----------
+    sigma : float
+        Scatter of log10 of the semi-major axis, in dex.
+    beyond : float
+        log10 of the largest semi-major axis over the mean one, in dex; infinite where there is none.
+    projection : {"isotropic", "inclination-uniform"}
+        Orientation of the orbits.
+    place : (n, m) float array
+        log10 of the separation times the distance over the mean semi-major axis, in dex.
+
+    Returns
+    -------
+    probability : (n, m) float array
+        In [0, 1].
+    """
+    return np.exp(_log_moments(sigma, beyond, projection, place.ravel(), 0)[:, 0]).reshape(place.shape)
