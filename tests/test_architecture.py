@@ -72,15 +72,26 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
         "config", "errors", "images", "moments", "psf", "response", "sample", "shapes", "stack", "stars", "systems",
     },
     "summary": {"config", "prediction", "psf", "response", "shapes", "systems"},
-    "io": {"files", "errors", "systems", "tables"},
+    "resolution": {"galaxies", "psf"},
+    "shares": {"prediction", "uncertainty"},
+    "budget": {
+        "averages", "errors", "galaxies", "instruments", "integrals", "multiplicity", "photometry", "prediction",
+        "response", "shares", "shear", "stars", "systems", "uncertainty",
+    },
+    "io": {"files", "errors", "galaxies", "systems", "tables"},
     "experiments": {"config", "galaxy", "multiplicity", "prediction", "simulation", "stars", "summary"},
     "figures": {"instruments", "stars"},
+    "diagrams": {"figures"},
     "report": {"files", "experiments", "figures", "instruments", "io", "summary"},
     "bench": {"config", "psf", "response", "sample", "shapes", "stack", "systems"},
     "terminal": set(),
     "answers": {"catalogs", "config", "errors", "gaia", "prediction", "sample", "stars"},
+    "decision": {
+        "answers", "budget", "config", "deconvolution", "diagrams", "errors", "galaxies", "instruments", "io",
+        "prediction", "psf", "resolution", "response", "sample", "shapes", "shares", "stars",
+    },
     "cli": {
-        "answers", "bench", "catalogs", "files", "figures", "config", "errors", "experiments", "gaia", "images", "io",
+        "answers", "bench", "decision", "catalogs", "files", "figures", "config", "errors", "experiments", "gaia", "images", "io",
         "kappa", "measurement", "prediction", "psf", "report", "response", "sample", "shapes", "simulation", "summary",
         "systems", "terminal", "toy",
     },
@@ -92,7 +103,9 @@ NEVER_REACHED = {  # followed through every module in between
     "uncertainty": {"stack", "simulation"},
     "images": {"response", "weighted", "stack", "prediction"},
     "stack": {"prediction", "response", "psf"},
+    "budget": {"stack", "simulation"},
     "figures": {"prediction", "stack", "simulation", "summary"},
+    "diagrams": {"prediction", "stack", "simulation", "summary", "budget"},
 }
 UNIT = re.compile(
     r"arcsec|deg\b|deg²|rad\b|\bpc\b|\bau\b|mag\b|M_sun|\byr\b|dex|pixel|in \[0, 1\]|in \(0, 1|dimensionless|\(count\)"

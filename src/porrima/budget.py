@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from porrima.averages import population_moments
+from porrima.errors import InputError
 from porrima.integrals import PairIntegrals, integrate, separation_moments
-from porrima.prediction import MANY_STARS, QUANTITIES, SeriesWarning, predict
+from porrima.prediction import MANY_STARS, SeriesWarning, predict
+from porrima.shares import GROUPS, Interval, MagnitudeBin, Share, stars_needed
 from porrima.shear import deconvolution_bias, moments_bias
 from porrima.systems import Population
 from porrima.uncertainty import NAMES, uncertainty
@@ -37,13 +39,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["GROUPS", "Budget", "Interval", "MagnitudeBin", "Setting", "Share", "budget", "stars_needed"]
-
-GROUPS = {"psf": QUANTITIES, "fit": ("m", "c1", "c2"), "moments": ("m", "c1", "c2")}
-"""What is measured, by who measures it: shape of the PSF; shear by a method that fits, or that subtracts moments."""
-
-VERDICTS = ("within", "uses all", "exceeds")
-"""Whole interval of the total below the requirement; the requirement in it; whole interval above."""
+__all__ = ["CUTS", "Budget", "Setting", "budget"]
 
 FEW_STARS = 200
 """Number of stars below which the scatter does not quite fall with the root of their number (count)."""
@@ -55,35 +51,6 @@ MOST_STARS = 400
 """Stars of a bin on which other cuts are tried, evenly through those given (count)."""
 
 _ROUNDS = 8  # at most, until the number of stars no longer moves
-
-
-class Interval(NamedTuple):
-    """A number with the ends of the interval in which it is known."""
-
-    value: float
-    low: float
-    high: float
-
-    @property
-    def size(self) -> Interval:
-        """The same without its sign."""
-        ends = sorted((abs(self.low), abs(self.high)))
-        return Interval(abs(self.value), 0.0 if self.low < 0 < self.high else ends[0], ends[1])
-
-    def over(self, unit: float) -> Interval:
-        """In another unit.
-
-        Parameters
-        ----------
-        unit : float
-            In the unit of the interval, positive.
-
-        Returns
-        -------
-        interval : Interval
-            Dimensionless.
-        """
-        return Interval(self.value / unit, self.low / unit, self.high / unit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,118 +88,6 @@ class Setting:
     binary_fraction: float | None = None
     fit: ShearResponse | None = None
     seen: Galaxies | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Share:
-    """One quantity beside what is required of it; all dimensionless, r2 over the size of the PSF.
-
-    Parameters
-    ----------
-    group, quantity : str
-        A key and a value of `GROUPS`.
-    required : float or None
-        Largest error allowed; None where the survey states none.
-    bias : Interval
-        Mean over patches, signed.
-    scatter : Interval
-        Standard deviation between patches.
-    total : Interval
-        Both in quadrature.
-    n_stars : Interval
-        Fewest stars for which the total meets the requirement; infinite where the bias alone exceeds it, NaN where
-        nothing is required (count).
-    """
-
-    group: str
-    quantity: str
-    required: float | None
-    bias: Interval
-    scatter: Interval
-    total: Interval
-    n_stars: Interval
-
-    @property
-    def share(self) -> Interval | None:
-        """Total over the requirement, dimensionless; None where nothing is required."""
-        return None if self.required is None else self.total.over(self.required)
-
-    @property
-    def verdict(self) -> str | None:
-        """One of `VERDICTS`; None where nothing is required."""
-        share = self.share
-        return None if share is None else VERDICTS[int(share.high > 1) + int(share.low > 1)]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MagnitudeBin:
-    """Budget of the stars of one range of magnitude.
-
-    Parameters
-    ----------
-    magnitude : (float, float)
-        Half-open range, in mag.
-    n_catalog_stars : int
-        Stars over which averages are taken (count).
-    uncertainty : Uncertainty
-        The prediction with its interval.
-    shares : tuple of Share
-        One for each quantity of each group.
-    widest_cut : dict
-        Widest cut with which all quantities of a group meet their requirements, in arcsec, sought up to twice the
-        given one or to where the series in kernel moments ends; NaN where there is none.
-    """
-
-    magnitude: tuple[float, float]
-    n_catalog_stars: int
-    uncertainty: Uncertainty
-    shares: tuple[Share, ...]
-    widest_cut: dict[str, float]
-
-    def required(self, group: str) -> list[Share]:
-        """Shares of a group of which something is required.
-
-        Parameters
-        ----------
-        group : str
-            A key of `GROUPS`.
-
-        Returns
-        -------
-        shares : list of Share
-            There may be none.
-        """
-        return [s for s in self.shares if s.group == group and s.required is not None]
-
-    def worst(self, group: str) -> Share:
-        """The share that takes most of its requirement.
-
-        Parameters
-        ----------
-        group : str
-            A key of `GROUPS` of which something is required.
-
-        Returns
-        -------
-        share : Share
-            Dimensionless.
-        """
-        return max(self.required(group), key=lambda s: s.total.value / (s.required or math.inf))
-
-    def n_stars(self, group: str) -> float:
-        """Fewest stars for which a whole group meets its requirements.
-
-        Parameters
-        ----------
-        group : str
-            A key of `GROUPS` of which something is required.
-
-        Returns
-        -------
-        n_stars : float
-            Infinite where a bias alone exceeds its requirement (count).
-        """
-        return max(s.n_stars.value for s in self.required(group))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -297,7 +152,8 @@ def budget(setting: Setting, bins: Sequence[tuple[tuple[float, float], Stars]]) 
     Raises
     ------
     InputError
-        As `uncertainty.uncertainty`.
+        As `uncertainty.uncertainty`, or if the cut is too wide for kernel moments of the PSF: with the order at which
+        the expansion stops being good.
     ValueError
         If the number of stars is less than 1.
 
@@ -321,27 +177,6 @@ def budget(setting: Setting, bins: Sequence[tuple[tuple[float, float], Stars]]) 
     return Budget(setting=setting, bins=tuple(_of_bin(setting, mag, stars) for mag, stars in bins))
 
 
-def stars_needed(bias: float, spread: float, required: float) -> float:
-    """Fewest stars whose rms error meets a requirement.
-
-    Parameters
-    ----------
-    bias : float
-        What more stars do not lower, dimensionless.
-    spread : float
-        Scatter times the root of the number of stars, dimensionless.
-    required : float
-        Largest rms error, dimensionless.
-
-    Returns
-    -------
-    n_stars : float
-        At least 1; infinite where the bias alone exceeds the requirement (count).
-    """
-    room = required**2 - bias**2
-    return math.inf if room <= 0 else float(max(1, math.ceil(spread**2 / room)))
-
-
 def _of_bin(setting: Setting, magnitude: tuple[float, float], stars: Stars) -> MagnitudeBin:
     population = Population.of(
         stars, multiplicity=setting.multiplicity, photometry=setting.photometry, cut=setting.cut
@@ -357,6 +192,12 @@ def _of_bin(setting: Setting, magnitude: tuple[float, float], stars: Stars) -> M
         n_stars=setting.n_stars,
         integrals=integrals,
     )
+    if np.any(np.isnan(known.prediction.bias)):
+        rule = (
+            "is too wide for the kernel moments of this PSF, whose expansion stops being good at order "
+            f"{known.prediction.last_order[0]}"
+        )
+        raise InputError(rule, key="cut", value=setting.cut)
     long = predict(known.prediction.population, setting.response, MANY_STARS)
     now, later = _changes(setting, known.prediction), _changes(setting, long)
     shares = tuple(
@@ -461,7 +302,9 @@ def _widest_cuts(
     totals = np.array(
         [_totals(setting, replace(some, cut=setting.cut * f), coefficient, required) for f in CUTS]
     )
-    used = totals / totals[CUTS.index(1.0)] * [s.total.value / (s.required or math.inf) for s in required]
+    now = totals[CUTS.index(1.0)]
+    scale = [s.total.value / (s.required or math.inf) for s in required]
+    used = totals * np.divide(scale, now, out=np.zeros_like(now), where=now > 0)
     out = {}
     for group in dict.fromkeys(s.group for s in required):
         share = used[:, [s.group == group for s in required]].max(axis=1)

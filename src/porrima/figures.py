@@ -15,9 +15,18 @@ if TYPE_CHECKING:
     from porrima.instruments import Requirement
     from porrima.stars import Stars
 
-__all__ = ["errors_and_biases", "galaxy_against_catalog", "population", "responses", "selection", "toy_maps"]
+__all__ = [
+    "COLOURS",
+    "STYLE",
+    "errors_and_biases",
+    "galaxy_against_catalog",
+    "population",
+    "responses",
+    "selection",
+    "toy_maps",
+]
 
-_COLOURS = (
+COLOURS = (
     "#0072b2",
     "#d55e00",
     "#009e73",
@@ -31,7 +40,7 @@ _PANELS = (
     ("e1", r"$\sigma(e_1)$", r"$\langle\delta e_1\rangle$"),
     ("e2", r"$\sigma(e_2)$", r"$\langle\delta e_2\rangle$"),
 )
-_STYLE = {
+STYLE = {
     "font.size": 9.0,
     "axes.linewidth": 0.8,
     "xtick.direction": "in",
@@ -63,7 +72,7 @@ def errors_and_biases(
     figure : Figure
         Ready to be written.
     """
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(7.4, 8.4), layout="constrained")
         axes = figure.subplots(3, 2, sharex=True)
         for row, (quantity, error_label, bias_label) in zip(axes, _PANELS, strict=True):
@@ -89,7 +98,7 @@ def _panel(
     n_psf = summary.sizes["psf"]
     for p, psf in enumerate(summary["psf"].to_numpy()):
         here = {"psf": psf, "quantity": quantity}
-        colour = _COLOURS[p % len(_COLOURS)]
+        colour = COLOURS[p % len(COLOURS)]
         shift = 0.5 * half * (p - 0.5 * (n_psf - 1)) / max(n_psf, 1)  # apart, to be told from each other
         axis.errorbar(
             centre + shift,
@@ -120,11 +129,11 @@ def _legend(figure: Figure, axis: Any, curves: xr.Dataset, requirement: Requirem
 
 
 _SHARES = (
-    ("0.1-0.5", _COLOURS[1], "0.1–0.5"),
-    ("0.5-1.5", _COLOURS[0], "0.5–1.5"),
-    ("0.5-0.7", _COLOURS[5], "0.5–0.7"),
-    ("0.7-1.5", _COLOURS[2], "0.7–1.5"),
-    ("below 0.1", _COLOURS[3], "below 0.1"),
+    ("0.1-0.5", COLOURS[1], "0.1–0.5"),
+    ("0.5-1.5", COLOURS[0], "0.5–1.5"),
+    ("0.5-0.7", COLOURS[5], "0.5–0.7"),
+    ("0.7-1.5", COLOURS[2], "0.7–1.5"),
+    ("below 0.1", COLOURS[3], "below 0.1"),
 )
 _SCANS = (
     ("l = 0", "$l = 0°$", "Galactic latitude $b$ [deg]"),
@@ -155,7 +164,7 @@ def selection(stars: Stars) -> Figure:
     }
     names = [n for n, start in groups.items() if np.any(np.char.startswith(stars.component, start))]
     masks = [np.char.startswith(stars.component, groups[name]) for name in names]
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(8.6, 3.1), layout="constrained")
         axes = figure.subplots(1, 3)
         per = f" per deg² ({stars.area:g} deg²)" if stars.area else ""
@@ -168,7 +177,7 @@ def selection(stars: Stars) -> Figure:
             edges = space(values.min(), values.max() * (1 + 1e-9), 31)
             weights = [np.full(int(m.sum()), 1 / stars.area if stars.area else 1.0) for m in masks]
             axis.hist([values[m] for m in masks], edges, weights=weights, stacked=True, label=names,
-                      color=_COLOURS[: len(names)])  # fmt: skip
+                      color=COLOURS[: len(names)])  # fmt: skip
             axis.set_xscale(scale)
             axis.set_xlabel(label)
         axes[0].set_ylabel("stars in each bin" + per)
@@ -193,7 +202,7 @@ def population(dataset: xr.Dataset) -> Figure:
     figure : Figure
         Ready to be written.
     """
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(7.4, 5.4), layout="constrained")
         axes = figure.subplots(2, 3, sharex="col", sharey="row")
         for column, (scan, title, label) in zip(axes.T, _SCANS, strict=True):
@@ -246,7 +255,7 @@ def galaxy_against_catalog(datasets: list[xr.Dataset]) -> Figure:
     figure : Figure
         Ready to be written.
     """
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(7.4, 9.0), layout="constrained")
         axes = figure.subplots(len(_BESIDE), len(datasets), sharex=True, sharey="row", squeeze=False)
         for column, data in zip(axes.T, datasets, strict=True):
@@ -266,7 +275,7 @@ def galaxy_against_catalog(datasets: list[xr.Dataset]) -> Figure:
                 axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
                 axis.yaxis.set_major_formatter(StrMethodFormatter("{x:.0f}"))
                 axis.yaxis.set_minor_formatter(NullFormatter())
-        axes[0, 0].plot([], [], color=_COLOURS[0], linewidth=1.3, label="analytic Galaxy")
+        axes[0, 0].plot([], [], color=COLOURS[0], linewidth=1.3, label="analytic Galaxy")
         axes[0, 0].legend(frameon=False, fontsize=7.5)
     return figure
 
@@ -275,10 +284,10 @@ def _beside(axis: Any, data: xr.Dataset, quantity: str, number: int, label: str)
     """The model as a staircase, the catalogue as points with their sampling errors."""
     here = data.sel(quantity=quantity)
     edges = [*data["mag_lo"].to_numpy(), float(data["mag_hi"][-1])]
-    axis.stairs(here["galaxy"], edges, color=_COLOURS[number], linewidth=1.3, baseline=None)
+    axis.stairs(here["galaxy"], edges, color=COLOURS[number], linewidth=1.3, baseline=None)
     axis.errorbar(
         0.5 * (data["mag_lo"] + data["mag_hi"]), here["catalog"], yerr=here["stderr"],
-        color=_COLOURS[number], marker=_MARKERS[number], markersize=3.6, linestyle="none", linewidth=0.9,
+        color=COLOURS[number], marker=_MARKERS[number], markersize=3.6, linestyle="none", linewidth=0.9,
         label=label,
     )  # fmt: skip
 
@@ -306,7 +315,7 @@ def toy_maps(maps: xr.Dataset) -> Figure:
     from matplotlib.colors import Normalize, SymLogNorm  # noqa: PLC0415
 
     columns = [(p, m) for p in range(maps.sizes["psf"]) for m in range(maps.sizes["delta_m"])]
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(1.95 * len(columns) + 1.2, 6.3), layout="constrained")
         axes = figure.subplots(3, len(columns), sharex=True, sharey=True, squeeze=False)
         for row, (name, label, colours, levels) in zip(axes, _TOY_ROWS, strict=True):
@@ -359,7 +368,7 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
     groups = list(dict.fromkeys(row["group"] for row in rows))
     estimators = list(dict.fromkeys(row["kind"] for row in rows))
     mixed = {g for g in groups if len({row["kind"] for row in rows if row["group"] == g}) > 1}
-    with rc_context(_STYLE):  # type: ignore[arg-type]
+    with rc_context(STYLE):  # type: ignore[arg-type]
         figure = Figure(figsize=(max(4.5, 0.42 * len(groups) + 1.4), 6.2), layout="constrained")
         axes = figure.subplots(2, 1, sharex=True)
         for name, axis, label in (
@@ -372,7 +381,7 @@ def responses(rows: list[dict[str, Any]]) -> Figure:
                 axis.plot(
                     [groups.index(r["group"]) + (shift if r["group"] in mixed else 0.0) for r in here],
                     [r[name] for r in here],
-                    linestyle="none", marker=_MARKERS[k], color=_COLOURS[k], markersize=4.0, alpha=0.8, label=estimator,
+                    linestyle="none", marker=_MARKERS[k], color=COLOURS[k], markersize=4.0, alpha=0.8, label=estimator,
                 )  # fmt: skip
             axis.axhline(1.0, color="0.35", linewidth=0.9, zorder=0)
             axis.set_ylabel(label)
