@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CUTS", "Budget", "Setting", "budget"]
 
-FEW_STARS = 200
+FEW_STARS = 40
 """Number of stars below which the scatter does not quite fall with the root of their number (count)."""
 
 CUTS = (0.04, 0.06, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.3, 1.5, 1.75, 2.0)
@@ -274,7 +274,7 @@ def _refined(
     setting: Setting, known: Uncertainty, group: str, k: int, n_stars: float, required: float
 ) -> float:
     """Number of stars found again with their own prediction, where they are few."""
-    if n_stars >= FEW_STARS:
+    if group != "psf" or n_stars >= FEW_STARS:  # m and c fall with the root, of fits exactly
         return n_stars
     for _ in range(_ROUNDS):
         prediction = predict(known.prediction.population, setting.response, int(n_stars))

@@ -167,7 +167,7 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Bias and error of the PSF's shape in closed form."""
-    from porrima.answers import population_config, predicted
+    from porrima.answers import PREDICTED_COLUMNS, population_config, predicted, predicted_lines
     from porrima.psf import psf_from_name
     from porrima.response import response
     from porrima.shapes import estimator_from_name
@@ -185,7 +185,7 @@ def predict(
     reply = response(profile, estimator_from_name(estimator))
     result = predicted(config, reply, binary_fraction, n_stars)
     header = f"{result['n_catalog_stars']} stars, {psf}, {estimator}, {multiplicity}"
-    show(result, as_json, header, ["quantity", "value"], [[k, v] for k, v in result.items()])
+    show(result, as_json, header, PREDICTED_COLUMNS, predicted_lines(result))
 
 
 @app.command()

@@ -16,7 +16,6 @@ from porrima.answers import population_config
 from porrima.budget import CUTS, Setting, budget
 from porrima.config import GalaxiesConfig, known, load_requirement, parse
 from porrima.deconvolution import fit_response
-from porrima.diagrams import budget_shares
 from porrima.errors import InputError
 from porrima.galaxies import Galaxies, r2_of_half_light
 from porrima.instruments import REQUIREMENTS, SURVEYS, Requirement, Survey
@@ -489,4 +488,6 @@ def write_budget(answer: dict[str, Any], table: Path | None, picture: Path | Non
         ]
         write_rows(rows, table)
     if picture is not None:
+        from porrima.diagrams import budget_shares  # noqa: PLC0415  (slow to import, where used)
+
         write_figure(budget_shares(answer), picture)
