@@ -73,6 +73,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     },
     "summary": {"config", "prediction", "psf", "response", "shapes", "systems"},
     "resolution": {"galaxies", "psf"},
+    "gain": {"averages", "integrals", "multiplicity", "photometry", "stars", "systems", "uncertainty"},
     "shares": {"prediction", "uncertainty"},
     "budget": {
         "averages", "errors", "galaxies", "instruments", "integrals", "multiplicity", "photometry", "prediction",
