@@ -93,13 +93,14 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
         "catalogs", "config", "distribution", "errors", "gaia", "integrals", "prediction", "response", "sample",
         "stars", "systems", "uncertainty",
     },
+    "ledger": {"budget", "diagrams", "errors", "galaxies", "io", "shares"},
     "decision": {
-        "answers", "budget", "config", "deconvolution", "diagrams", "errors", "galaxies", "instruments", "io",
-        "prediction", "psf", "resolution", "response", "sample", "shapes", "shares", "stars",
+        "answers", "budget", "config", "deconvolution", "errors", "galaxies", "instruments", "io", "ledger",
+        "psf", "resolution", "response", "sample", "shapes", "stars",
     },
     "cli": {
         "answers", "bench", "catalogs", "config", "decision", "errors", "experiments", "figures", "files", "gaia",
-        "images", "io", "kappa", "measurement", "prediction", "psf", "report", "response", "sample", "shapes",
+        "images", "io", "kappa", "ledger", "measurement", "prediction", "psf", "report", "response", "sample", "shapes",
         "simulation", "summary", "systems", "terminal", "toy",
     },
 }  # fmt: skip

@@ -230,24 +230,15 @@ def budget(
     as_json: Json = False,
 ) -> None:
     """Share of a survey's requirements that unresolved binaries use, by magnitude."""
-    from porrima.decision import (
-        BUDGET_COLUMNS,
-        budget_answer,
-        budget_lines,
-        galaxies_of,
-        header_of,
-        magnitude_bins,
-        survey_of,
-        write_budget,
-    )  # fmt: skip
+    from porrima.decision import decided
+    from porrima.ledger import BUDGET_COLUMNS, budget_lines, header_of, write_budget
 
     catalog, format = _table_of(stars, catalog, format)  # noqa: A001
-    survey, requirement = survey_of(instrument, requirements)
-    result, found = budget_answer(
-        survey, requirement, galaxies_of(galaxy_size, galaxies), magnitude_bins(mag, bins, step),
-        psf=psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter, estimator=estimator, n_stars=n_stars,
-        binary_fraction=binary_fraction, cut=cut, l=l, b=b, catalog=catalog, format=format, map=map, options=options,
-        band=band, seed=seed, multiplicity=multiplicity, photometry=photometry,
+    result, found = decided(
+        instrument=instrument, requirements=requirements, galaxy_size=galaxy_size, galaxies=galaxies, mag=mag,
+        bins=bins, step=step, psf=psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter, estimator=estimator,
+        n_stars=n_stars, binary_fraction=binary_fraction, cut=cut, l=l, b=b, catalog=catalog, format=format, map=map,
+        options=options, band=band, seed=seed, multiplicity=multiplicity, photometry=photometry,
     )  # fmt: skip
     write_budget(result, output, plot)
     show(result, as_json, header_of(result, multiplicity), BUDGET_COLUMNS, budget_lines(found))

@@ -145,6 +145,21 @@ class MagnitudeBin:
         """
         return max(self.required(group), key=lambda s: s.total.value / (s.required or math.inf))
 
+    def verdict(self, group: str) -> str:
+        """The most severe verdict on a group.
+
+        Parameters
+        ----------
+        group : str
+            A key of `GROUPS` of which something is required.
+
+        Returns
+        -------
+        verdict : str
+            One of `VERDICTS`.
+        """
+        return max((s.verdict or VERDICTS[0] for s in self.required(group)), key=VERDICTS.index)
+
     def n_stars(self, group: str) -> float:
         """Fewest stars for which a whole group meets its requirements.
 
