@@ -78,13 +78,22 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
         "systems", "tallies",
     },
     "summary": {"config", "prediction", "psf", "response", "shapes", "store", "systems", "tallies"},
-    "io": {"files", "errors", "systems", "tables"},
+    "resolution": {"galaxies", "psf"},
+    "gain": {"averages", "integrals", "multiplicity", "photometry", "stars", "systems", "uncertainty"},
+    "shares": {"prediction", "uncertainty"},
+    "budget": {
+        "averages", "errors", "galaxies", "instruments", "integrals", "multiplicity", "photometry", "prediction",
+        "response", "shares", "shear", "stars", "systems", "uncertainty",
+    },
+    "io": {"files", "errors", "galaxies", "systems", "tables"},
     "experiments": {
-        "config", "galaxy", "multiplicity", "prediction", "simulation", "stars", "store", "summary",
+        "config", "galaxy", "multiplicity", "prediction", "psf", "response", "sample", "shapes", "simulation", "stars",
+        "store", "summary", "uncertainty",
     },
     "figures": {"instruments"},
     "star_figures": {"figures", "stars"},
     "scatter_figure": {"figures"},
+    "diagrams": {"figures", "instruments"},
     "report": {"files", "experiments", "figures", "instruments", "io", "summary"},
     "machine": set(),
     "timings": set(),
@@ -96,11 +105,19 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     },
     "performance": {"figures", "files", "io"},
     "terminal": set(),
-    "answers": {"catalogs", "config", "errors", "gaia", "prediction", "sample", "stars"},
+    "answers": {
+        "catalogs", "config", "distribution", "errors", "gaia", "integrals", "prediction", "response", "sample",
+        "stars", "systems", "uncertainty",
+    },
+    "ledger": {"budget", "diagrams", "errors", "galaxies", "io", "shares"},
+    "decision": {
+        "answers", "budget", "config", "deconvolution", "errors", "galaxies", "instruments", "io", "ledger",
+        "psf", "resolution", "response", "sample", "shapes", "stars",
+    },
     "cli": {
-        "answers", "bench", "catalogs", "files", "config", "errors", "experiments", "gaia", "images", "io",
-        "kappa", "machine", "measurement", "performance", "prediction", "psf", "report", "response", "sample", "shapes",
-        "simulation", "star_figures", "store", "summary", "systems", "terminal", "toy",
+        "answers", "bench", "catalogs", "config", "decision", "errors", "experiments", "figures", "files", "gaia",
+        "images", "io", "kappa", "ledger", "machine", "measurement", "performance", "prediction", "psf", "report",
+        "response", "sample", "shapes", "simulation", "star_figures", "store", "summary", "systems", "terminal", "toy",
     },
 }  # fmt: skip
 NEVER_REACHED = {  # followed through every module in between
@@ -111,7 +128,9 @@ NEVER_REACHED = {  # followed through every module in between
     "images": {"response", "weighted", "stack", "prediction"},
     "stack": {"prediction", "response", "psf"},
     "peers": {"stack", "pairs", "response", "weighted", "prediction"},
+    "budget": {"stack", "simulation"},
     "figures": {"prediction", "stack", "simulation", "summary"},
+    "diagrams": {"prediction", "stack", "simulation", "summary", "budget"},
 }
 UNIT = re.compile(
     r"arcsec|deg\b|deg²|rad\b|\bpc\b|\bau\b|mag\b|M_sun|\byr\b|dex|pixel|in \[0, 1\]|in \(0, 1|dimensionless|\(count\)"

@@ -12,20 +12,26 @@ import numpy as np
 import yaml
 
 from porrima.config import PopulationConfig, parse
+from porrima.distribution import size_distribution
 from porrima.errors import InputError
 from porrima.gaia import fetch_cone
 from porrima.prediction import QUANTITIES, SeriesWarning, integrate, population_moments, predict
 from porrima.sample import draw_stars, population_of
+from porrima.uncertainty import NAMES, uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from porrima.catalogs import Catalog
+    from porrima.integrals import PairIntegrals
+    from porrima.prediction import Prediction
+    from porrima.response import Response
     from porrima.stars import Stars
+    from porrima.systems import Population
 
 __all__ = [
-    "COUNT_COLUMNS", "NUMBER_COLUMNS", "count_lines", "gaia_cone", "number_lines", "population_config", "predicted",
-    "stars_answer",
+    "COUNT_COLUMNS", "NUMBER_COLUMNS", "PREDICTED_COLUMNS", "count_lines", "gaia_cone", "number_lines",
+    "population_config", "predicted", "predicted_lines", "stars_answer",
 ]  # fmt: skip
 
 
@@ -126,7 +132,7 @@ def _model_with_options(name: str, text: str) -> Any:
 
 
 def predicted(
-    config: PopulationConfig, reply: Any, binary_fraction: float | None, n_stars: int | None
+    config: PopulationConfig, reply: Response, binary_fraction: float | None, n_stars: int | None
 ) -> dict[str, Any]:
     """What `predict` shows.
 
@@ -153,7 +159,8 @@ def predicted(
     """
     population = population_of(config, draw_stars(config))
     fraction = None if binary_fraction is None else np.array([binary_fraction])
-    moments = population_moments(population, integrate(population), fraction)
+    integrals = integrate(population)
+    moments = population_moments(population, integrals, fraction)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", SeriesWarning)
         prediction = predict(moments, reply, n_stars)
@@ -170,6 +177,10 @@ def predicted(
         for name in ("bias", "sigma", "sd")
         for quantity, value in zip(QUANTITIES, getattr(prediction, name)[:, 0], strict=True)
     }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SeriesWarning)  # said already
+        known = _known(config, population, reply, binary_fraction, n_stars, integrals)
+        known |= _quantiles(population, reply, binary_fraction, n_stars, integrals)
     return {
         "mean_x": moments.mean_x[0],
         "mean_x2": moments.mean_x2[0],
@@ -182,8 +193,99 @@ def predicted(
         "unresolved_fraction": moments.unresolved_fraction[0],
         "removed_fraction": moments.removed_fraction[0],
         "n_catalog_stars": len(population.stars),
+        **_spread(prediction),
+        "quadrature_error": moments.relative_error[0],
+        **known,
     }
 
+
+def _spread(prediction: Prediction) -> dict[str, float]:
+    """Covariance of e1, e2 and ln R², and the numbers of stars at which bias overtakes scatter."""
+    names, c = ("e1", "e2", "lnr2"), prediction.log_covariance[..., 0]
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)]
+    return {f"covariance_{names[i]}_{names[j]}": float(c[i, j]) for i, j in pairs} | {
+        f"crossover_n_stars_{quantity}": float(value)
+        for quantity, value in zip(QUANTITIES, prediction.crossover_n_stars[:, 0], strict=True)
+    }
+
+
+def _known(
+    config: PopulationConfig,
+    population: Population,
+    reply: Response,
+    binary_fraction: float | None,
+    n_stars: int | None,
+    integrals: PairIntegrals,
+) -> dict[str, Any]:
+    """Interval of each quantity, and what moves eta; nothing for stars of unequal weight."""
+    names = [f"{name}_{end}" for name in NAMES for end in ("low", "high")]
+    if config.stack_weight != "equal":
+        return dict.fromkeys([*names, "sources"])
+    found = uncertainty(
+        population.stars,
+        reply,
+        multiplicity=config.multiplicity.build(),
+        photometry=config.photometry.build(),
+        cut=config.cut,
+        binary_fraction=binary_fraction,
+        n_stars=n_stars,
+        integrals=integrals,
+    )
+    ends = [end for name in NAMES for end in found.interval(name)]
+    ranking = [{"source": source, "change": change} for source, change in found.ranking()]
+    return dict(zip(names, ends, strict=True)) | {"sources": ranking}
+
+
+def _quantiles(
+    population: Population,
+    reply: Response,
+    binary_fraction: float | None,
+    n_stars: int | None,
+    integrals: PairIntegrals,
+) -> dict[str, Any]:
+    """Quantiles of the size change of a stack of so many stars of equal weight."""
+    if n_stars is None or n_stars > MOST_STARS or not np.all(population.weight == 1.0):
+        return {"size_quantiles": None}
+    found = size_distribution(population, reply, n_stars, binary_fraction, integrals)
+    values = found.quantile(np.array(PROBABILITIES)).tolist()
+    rows = [{"probability": p, "dr2_rel": v} for p, v in zip(PROBABILITIES, values, strict=True)]
+    return {"size_quantiles": rows}
+
+
+def predicted_lines(answer: dict[str, Any]) -> list[list[Any]]:
+    """Lines of a prediction for the terminal: quantity, value, and the ends of its interval where it has one.
+
+    Parameters
+    ----------
+    answer : dict
+        From `predicted`: arcsec², arcsec⁴ and dimensionless.
+
+    Returns
+    -------
+    lines : list of list
+        Under `PREDICTED_COLUMNS`.
+    """
+    ends = ("_low", "_high")
+    lines = []
+    for key, value in answer.items():
+        if isinstance(value, list) or key.endswith(ends):
+            continue
+        known = [answer.get(key + end) for end in ends]
+        lines.append([key, value, *("" if end is None else end for end in known)])
+    for row in answer["size_quantiles"] or []:
+        lines.append([f"dr2_rel at {row['probability']:g}", row["dr2_rel"], "", ""])
+    for row in answer["sources"] or []:
+        lines.append([f"eta moves by {row['source']}", row["change"], "", ""])
+    return lines
+
+
+PREDICTED_COLUMNS = ["quantity", "value", "low", "high"]
+
+PROBABILITIES = (0.05, 0.16, 0.5, 0.84, 0.95, 0.99)
+"""At which the size change of a stack is given (dimensionless)."""
+
+MOST_STARS = 100_000
+"""Stars above which quantiles are those of a normal law, and finer than the lattice of `distribution` (count)."""
 
 COUNT_COLUMNS = ["stars", "per deg²", "median distance [pc]", "mean mass [M_sun]", "multiplicity fraction"]
 

@@ -13,7 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from porrima.errors import InputError
 
-__all__ = ["EXAMPLE", "Multiplicity", "PopulationConfig", "RunConfig", "StarsConfig", "load", "parse"]
+__all__ = [
+    "EXAMPLE", "GalaxiesConfig", "Multiplicity", "PopulationConfig", "RequirementConfig", "RunConfig", "StarsConfig",
+    "load", "load_requirement", "parse",
+]  # fmt: skip
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -185,6 +188,42 @@ class RunConfig(PopulationConfig):
         return float(value)
 
 
+class RequirementConfig(_Strict):
+    """Requirements of a user's own; what is not given is not required."""
+
+    name: str = "own"
+    sigma_e: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    sigma_r2: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    m: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    c: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    source: str = "not stated"
+
+    @model_validator(mode="after")
+    def _some(self) -> RequirementConfig:
+        if all(value is None for value in (self.sigma_e, self.sigma_r2, self.m, self.c)):
+            raise ValueError("must have at least one of sigma_e, sigma_r2, m, c")
+        return self
+
+
+class GalaxiesConfig(_Strict):
+    """Galaxies whose shear is measured: one size, a law of sizes, or a table of them."""
+
+    half_light_radius: float | None = Field(
+        default=None, gt=0, allow_inf_nan=False
+    )  # arcsec; the law's median
+    scatter: float = Field(default=0.0, ge=0, allow_inf_nan=False)  # of log10 of the radius, dex
+    smallest: float = Field(default=0.0, ge=0, allow_inf_nan=False)  # radius, arcsec
+    file: Path | None = None
+    index: float = Field(default=1.0, ge=0.3, le=6.2)  # Sersic
+    mean_e2: float = Field(default=0.16, ge=0, lt=1)
+
+    @model_validator(mode="after")
+    def _one_source(self) -> GalaxiesConfig:
+        if (self.half_light_radius is None) == (self.file is None):
+            raise ValueError("must have either half_light_radius or a file")
+        return self
+
+
 class _UniqueKeys(yaml.SafeLoader):
     """YAML whose keys may stand only once."""
 
@@ -244,6 +283,36 @@ def load(path: Path) -> RunConfig:
     InputError
         If the file cannot be read, is not YAML, or a key or value in it is wrong.
     """
+    config = parse(RunConfig, _mapping(path), source=path)
+    if config.stars.catalog is not None:
+        stars = config.stars.model_copy(update={"catalog": path.parent / config.stars.catalog})
+        config = config.model_copy(update={"stars": stars})
+    return config
+
+
+def load_requirement(path: Path) -> RequirementConfig:
+    """Requirements read from a YAML file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    requirement : RequirementConfig
+        Validated, dimensionless.
+
+    Raises
+    ------
+    InputError
+        As `load`.
+    """
+    return parse(RequirementConfig, _mapping(path), source=path)
+
+
+def _mapping(path: Path) -> dict[str, Any]:
+    """Keys and values of a YAML file."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -258,11 +327,7 @@ def load(path: Path) -> RunConfig:
         raise InputError(f"is not YAML ({getattr(error, 'problem', error)})", source=path, row=row) from None
     if not isinstance(data, dict):
         raise InputError("must hold keys and values", source=path, value=type(data).__name__)
-    config = parse(RunConfig, data, source=path)
-    if config.stars.catalog is not None:
-        stars = config.stars.model_copy(update={"catalog": path.parent / config.stars.catalog})
-        config = config.model_copy(update={"stars": stars})
-    return config
+    return data
 
 
 def parse(model: type[Model], data: Any, source: Path | None = None) -> Model:

@@ -8,13 +8,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from porrima.config import RunConfig, parse
+from porrima.config import PopulationConfig, RunConfig, parse
 from porrima.galaxy import Robin2003
 from porrima.multiplicity import DucheneKraus2013
-from porrima.prediction import integrate, population_moments
+from porrima.prediction import integrate, population_moments, predict
+from porrima.psf import psf_from_name, sheared_gaussian
+from porrima.response import response
+from porrima.sample import draw_stars
+from porrima.shapes import Adaptive
 from porrima.simulation import simulate
 from porrima.store import open_run
 from porrima.summary import predicted_curves, summarise
+from porrima.uncertainty import uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,8 +34,8 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 __all__ = [
-    "EffectOfNStars", "ErrorsAndBiases", "effect_of_n_stars", "errors_and_biases", "galaxy_against_catalog",
-    "n_stars_configs", "paper_config", "population", "store_name",
+    "EffectOfNStars", "ErrorsAndBiases", "against_magnitude", "effect_of_n_stars", "errors_and_biases",
+    "galaxy_against_catalog", "n_stars_configs", "paper_config", "population", "store_name",
 ]  # fmt: skip
 
 QUICK, FULL = 100_000, 500_000  # stacks; the paper has "hundreds of thousands"
@@ -40,6 +45,15 @@ N_STARS = (40, 750, 2100, 10_000)
 N_STARS_QUICK, N_STARS_FULL = 10_000, 100_000  # stacks of each
 N_STARS_PSF = ("psf1", "psf2")
 GAP_RULES = {name: DucheneKraus2013(gap_rule=name) for name in ("lower", "solar")}
+ELLIPTICITIES = (0.02, 0.05, 0.1, 0.15, 0.2)
+"""Of the Gaussian PSFs of the magnitude figure, along x (dimensionless)."""
+
+SURVEY_PSFS = {
+    "Euclid VIS": {"name": "optical1", "pixel": 0.1, "jitter": 0.029},
+    "Roman H158": {"name": "roman:H158:SCA01", "pixel": 0.11},
+}
+"""PSFs of surveys in the magnitude figure, with pixel and jitter in arcsec."""
+
 MASS_CLASSES = {
     "below 0.1": (0.0, 0.1),
     "0.1-0.5": (0.1, 0.5),
@@ -375,4 +389,83 @@ def galaxy_against_catalog(
         {"catalog": (dims, value), "stderr": (dims, stderr), "galaxy": (dims, expected)},
         coords={"quantity": names, "mag_lo": ("bin", magnitudes[:-1]), "mag_hi": ("bin", magnitudes[1:])},
         attrs={"band": stars.band, "l": direction[0], "b": direction[1], "source": stars.source},
+    )
+
+
+def against_magnitude(
+    edges: FloatArray,
+    models: dict[str, DucheneKraus2013],
+    *,
+    binary_fraction: float | None = 0.35,
+    n_stars: int = 10_000,
+    n_drawn: int = 4000,
+    seed: int = 1,
+) -> xr.Dataset:
+    r"""Mean x and errors of the PSF against magnitude (KCM16 Sect. 5.4), Gaussian PSFs and those of surveys.
+
+    Parameters
+    ----------
+    edges : (n + 1,) float array
+        Of the bins of magnitude, in mag.
+    models : dict
+        Multiplicity models by name.
+    binary_fraction : float, optional
+        In [0, 1]; None for each model's own.
+    n_stars : int
+        Stars in a stack, for its scatter (count).
+    n_drawn : int
+        Stars drawn from the analytic Galaxy at l = 180°, b = 45° in each bin (count).
+    seed : int
+        Of those stars.
+
+    Returns
+    -------
+    dataset : Dataset
+        ``mean_x`` in arcsec² with ``mean_x_low`` and ``mean_x_high`` (model, bin); ``limit_e`` (model, psf, bin), the
+        error of the ellipticity as a vector for infinitely many stars, ``sd_e``, its scatter in a component for
+        `n_stars`, and ``limit_r2`` and ``sd_r2`` likewise; ``e_0``, ``r2_0`` [arcsec²] (psf).  Dimensionless but for
+        sizes.
+
+    References
+    ----------
+    KCM16
+    """
+    import xarray as xr  # noqa: PLC0415  (slow to import, needed for results only)
+
+    psfs = {f"e = {e:g}": sheared_gaussian(f"e = {e:g}", e, 0.0) for e in ELLIPTICITIES}
+    psfs |= {name: psf_from_name(**options) for name, options in SURVEY_PSFS.items()}  # type: ignore[arg-type]
+    replies = [response(psf, Adaptive()) for psf in psfs.values()]
+    shape = (len(models), len(psfs), edges.size - 1)
+    of_psf = {name: np.empty(shape) for name in ("limit_e", "sd_e", "limit_r2", "sd_r2")}
+    of_x = {name: np.empty((shape[0], shape[2])) for name in ("mean_x", "mean_x_low", "mean_x_high")}
+    for k in range(edges.size - 1):
+        where = {"l": 180, "b": 45, "mag": (edges[k], edges[k + 1]), "n_drawn": n_drawn}
+        for i, model in enumerate(models.values()):
+            config = parse(PopulationConfig, {"stars": where, "seed": seed})
+            stars, light = draw_stars(config), config.photometry.build()
+            found = uncertainty(
+                stars, replies[0], multiplicity=model, photometry=light, binary_fraction=binary_fraction
+            )
+            r2_0, moments = found.prediction.r2_0, found.prediction.population
+            ends = zip(of_x, (found.value[0], *found.interval("eta")), strict=True)
+            for name, eta in ends:
+                of_x[name][i, k] = eta * r2_0
+            for j, reply in enumerate(replies):
+                limit, stack = predict(moments, reply), predict(moments, reply, n_stars)
+                of_psf["limit_e"][i, j, k] = np.hypot(*limit.bias[:2, 0])
+                of_psf["limit_r2"][i, j, k] = abs(limit.bias[2, 0])
+                of_psf["sd_e"][i, j, k], of_psf["sd_r2"][i, j, k] = stack.sd[0, 0], stack.sd[2, 0]
+    zero = [reply.shape0 for reply in replies]
+    return xr.Dataset(
+        {name: (("model", "psf", "bin"), values) for name, values in of_psf.items()}
+        | {name: (("model", "bin"), values) for name, values in of_x.items()}
+        | {"e_0": ("psf", [float(np.hypot(s.e1, s.e2)) for s in zero])}
+        | {"r2_0": ("psf", [float(s.r2) for s in zero])},
+        coords={
+            "model": list(models),
+            "psf": list(psfs),
+            "mag_lo": ("bin", edges[:-1]),
+            "mag_hi": ("bin", edges[1:]),
+        },
+        attrs={"n_stars": n_stars, "binary_fraction": binary_fraction, "band": "i"},
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 from porrima.errors import InputError
 from porrima.files import write_table, write_whole
+from porrima.galaxies import Galaxies, r2_of_half_light
 from porrima.systems import Systems
 from porrima.tables import column_values, load_table, open_catalog
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-__all__ = ["read_systems", "write_figure", "write_rows"]
+__all__ = ["read_galaxies", "read_systems", "write_figure", "write_rows"]
 
 _PAIR_COLUMNS = {"flux_ratio": "", "dx": "arcsec", "dy": "arcsec"}
 _WIDEST = 10.0  # arcsec; what is wider is no unresolved pair for any survey
@@ -68,6 +69,56 @@ def read_systems(path: Path) -> Systems:
     if not w.sum() > 0:
         raise InputError("must have a positive sum", source=path, column="weight", value=w.sum())
     return Systems.from_pairs(f, values["dx"], values["dy"], w)
+
+
+def read_galaxies(path: Path, index: float, mean_e2: float, smallest: float = 0.0) -> Galaxies:
+    """Galaxies of given half-light radii from a table.
+
+    Parameters
+    ----------
+    path : Path
+        Any table that astropy reads, with a column ``half_light_radius`` [arcsec] and, optionally, ``weight``.
+    index : float
+        Sersic index of all, dimensionless.
+    mean_e2 : float
+        Mean square of their ellipticity before lensing, in [0, 1).
+    smallest : float
+        Half-light radius below which they are left out, in arcsec.
+
+    Returns
+    -------
+    galaxies : Galaxies
+        With weights that sum to 1.
+
+    Raises
+    ------
+    InputError
+        If the column is missing, there are no galaxies, or a value breaks its rule: names the row.
+    """
+    table, row = load_table(open_catalog(path, {}, None))
+    if "half_light_radius" not in table.colnames:
+        names = ", ".join(table.colnames)
+        raise InputError(f"is missing; the table has {names}", source=path, column="half_light_radius")
+    if not len(table):
+        raise InputError("must have rows below its header", source=path)
+    radius = column_values(path, table["half_light_radius"], "half_light_radius", "arcsec", row)
+    weight = np.ones(len(table))
+    if "weight" in table.colnames:
+        weight = column_values(path, table["weight"], "weight", "", row)
+    good = {
+        "half_light_radius": (
+            "must be positive and finite [arcsec]",
+            np.isfinite(radius) & (radius > 0),
+            radius,
+        ),
+        "weight": ("must be finite and not negative", np.isfinite(weight) & (weight >= 0), weight),
+    }
+    for name, (rule, fine, values) in good.items():
+        if not np.all(fine):
+            k = int(np.argmin(fine))
+            raise InputError(rule, source=path, row=int(row[k]), column=name, value=values[k])
+    galaxies = Galaxies.sersic(radius, index, weight, mean_e2=mean_e2)
+    return galaxies.larger_than(smallest**2 * r2_of_half_light(index)) if smallest > 0 else galaxies
 
 
 def write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -154,12 +155,13 @@ def _page(numbers: ErrorsAndBiases, of_n_stars: xr.Dataset, figure: Figure, seco
 
 def _answer(numbers: ErrorsAndBiases) -> str:
     limit = numbers.limit.isel(psf=0).sel(quantity="r2").interp(binary_fraction=0.35)
-    share = float(limit["bias"]) / KCM16.sigma_r2
+    required = KCM16.sigma_r2 or math.inf
+    share = float(limit["bias"]) / required
     models = f"{numbers.config.multiplicity.model}, {numbers.config.estimator} moments"
     return (
         f"With 35 % binaries the mean of x = f r²/(1 + f)² over the stars is {_power(numbers.mean_x)} arcsec², and the "
         f"PSF of a stack comes out larger by {_power(float(limit['bias']))} ({models}): "
-        f"{share:.0%} of the size requirement of {_power(KCM16.sigma_r2)}. More stars in the stack lower the scatter, "
+        f"{share:.0%} of the size requirement of {_power(required)}. More stars in the stack lower the scatter, "
         "not this bias."
     )
 

@@ -1,0 +1,160 @@
+"""The figures of predictions: what they show was computed elsewhere."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from matplotlib import colormaps, rc_context
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from porrima.figures import COLOURS, STYLE
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from porrima.instruments import Requirement
+
+__all__ = ["against_magnitude", "budget_shares"]
+
+_RED = "#b00020"
+_TITLES = {"psf": "shape of the PSF", "fit": "shear, fit", "moments": "shear, moments"}
+_LABELS = {"e1": "$e_1$", "e2": "$e_2$", "r2": "$R^2$", "m": "$m$", "c1": "$c_1$", "c2": "$c_2$"}
+
+
+def budget_shares(answer: dict[str, Any]) -> Figure:
+    """Share of each requirement against magnitude, a panel for each group.
+
+    Parameters
+    ----------
+    answer : dict
+        As `porrima budget --json` prints it: lines are the rms error over the requirement, dotted ones the bias alone,
+        bands the interval of the rms error; dimensionless against mag.
+
+    Returns
+    -------
+    figure : Figure
+        Ready to be written.
+    """
+    rows = [row for row in answer["shares"] if row["required"] is not None]
+    groups = list(dict.fromkeys(row["group"] for row in rows))
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(0.6 + 2.8 * len(groups), 3.4), layout="constrained")
+        axes = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
+        for axis, group in zip(axes, groups, strict=True):
+            here = [row for row in rows if row["group"] == group]
+            for colour, quantity in zip(
+                COLOURS, dict.fromkeys(row["quantity"] for row in here), strict=False
+            ):
+                _share_line(axis, [row for row in here if row["quantity"] == quantity], colour)
+            axis.axhline(1.0, color=_RED, linestyle=":", linewidth=1.2)
+            axis.set(yscale="log", xlabel="magnitude", title=_TITLES[group])
+            axis.legend(frameon=False, fontsize=8)
+        axes[0].set_ylabel("share of the requirement")
+        highest = max(row["total_high"] / row["required"] for row in rows)
+        lowest = min(row["total"] / row["required"] for row in rows)
+        axes[0].set_ylim(max(1e-3, 0.4 * lowest), max(2.0, 1.5 * highest))
+        figure.suptitle(f"{answer['requirement']}, {answer['n_stars']} stars", fontsize=9.5)
+    return figure
+
+
+def _share_line(axis: Any, rows: list[dict[str, Any]], colour: str) -> None:
+    """One quantity: rms error with its interval, and the bias where there is one."""
+    edges = [*(row["mag_lo"] for row in rows), rows[-1]["mag_hi"]]
+    total, low, high = (
+        [row[name] / row["required"] for row in rows] for name in ("total", "total_low", "total_high")
+    )
+    axis.stairs(total, edges, color=colour, linewidth=1.4, baseline=None, label=_LABELS[rows[0]["quantity"]])
+    axis.stairs(high, edges, baseline=low, fill=True, color=colour, alpha=0.12, linewidth=0)
+    axis.stairs(
+        [row["bias_share"] for row in rows], edges, color=colour, linewidth=1.0, linestyle=":", baseline=None
+    )
+
+
+_ROWS = (
+    ("mean_x", r"$\langle x \rangle$ [arcsec$^2$]", (1e-7, 3e-5)),
+    ("e", r"$\sigma(e)$", (1e-6, 1e-3)),
+    ("r2", r"$\sigma(R^2)/R_0^2$", (3e-5, 5e-3)),
+)
+_SURVEYS = (("--", "D"), ("-.", "^"))  # line and symbol of each survey's PSF
+
+
+def against_magnitude(data: xr.Dataset, requirement: Requirement) -> Figure:
+    """Mean x, error of the ellipticity and of the size against magnitude (KCM16 Sect. 5.4), a column for each model.
+
+    Parameters
+    ----------
+    data : Dataset
+        From `experiments.against_magnitude`: arcsec² and dimensionless against mag.
+    requirement : Requirement
+        Drawn as dotted lines.
+
+    Returns
+    -------
+    figure : Figure
+        Colours are the ellipticities of Gaussian PSFs, grey lines with symbols PSFs of surveys; the band is the
+        interval in which the mean of x is known, the thin grey lines the scatter of a stack.
+    """
+    models = [str(name) for name in data["model"].to_numpy()]
+    middle = 0.5 * (data["mag_lo"] + data["mag_hi"])
+    norm = Normalize(0.0, float(data["e_0"].sel(psf=_gaussians(data)).max()))
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(7.4, 8.2), layout="constrained")
+        axes = figure.subplots(len(_ROWS), len(models), sharex=True, sharey="row", squeeze=False)
+        for column, model in zip(axes.T, models, strict=True):
+            here = data.sel(model=model)
+            column[0].fill_between(
+                middle, here["mean_x_low"], here["mean_x_high"], color=COLOURS[0], alpha=0.15
+            )
+            column[0].plot(middle, here["mean_x"], color=COLOURS[0], linewidth=1.4)
+            for axis, quantity, required in (
+                (column[1], "e", requirement.sigma_e), (column[2], "r2", requirement.sigma_r2),
+            ):  # fmt: skip
+                _errors(axis, here, quantity, middle, norm)
+                axis.axhline(required, color=_RED, linestyle=":", linewidth=1.2)
+            column[0].set_title(model, fontsize=9.5)
+            column[-1].set_xlabel(f"${data.attrs['band']}$ [mag]")
+        for row, (_, label, limits) in zip(axes, _ROWS, strict=True):
+            row[0].set(yscale="log", ylabel=label, ylim=limits)
+        bar = ScalarMappable(norm, colormaps["viridis"])
+        figure.colorbar(bar, ax=axes[1], label="$e$ of Gaussian PSFs", pad=0.01)
+        _magnitude_legend(figure, axes, data, requirement)
+    return figure
+
+
+def _gaussians(data: xr.Dataset) -> list[str]:
+    return [str(name) for name in data["psf"].to_numpy() if str(name).startswith("e = ")]
+
+
+def _errors(axis: Any, data: xr.Dataset, quantity: str, middle: Any, norm: Normalize) -> None:
+    """Errors for infinitely many stars behind each PSF, and the scatter behind the first."""
+    names = [str(name) for name in data["psf"].to_numpy()]
+    gaussians = _gaussians(data)
+    for name in gaussians if quantity == "e" else gaussians[:1]:
+        here = data.sel(psf=name)
+        colour = colormaps["viridis"](norm(float(here["e_0"]))) if quantity == "e" else COLOURS[0]
+        axis.plot(middle, here[f"limit_{quantity}"], color=colour, linewidth=1.4)
+    surveys = [name for name in names if name not in gaussians]
+    for name, (style, marker) in zip(surveys, _SURVEYS, strict=True):
+        one = data.sel(psf=name)[f"limit_{quantity}"]
+        axis.plot(middle, one, color="0.35", linestyle=style, marker=marker, markersize=3.2, linewidth=1.0)
+    axis.plot(middle, data[f"sd_{quantity}"].isel(psf=0), color="0.6", linewidth=0.8)
+
+
+def _magnitude_legend(figure: Figure, axes: Any, data: xr.Dataset, requirement: Requirement) -> None:
+    surveys = [str(name) for name in data["psf"].to_numpy() if str(name) not in _gaussians(data)]
+    entries: list[tuple[dict[str, Any], str]] = [
+        ({"color": COLOURS[0]}, "Gaussian PSF, infinitely many stars")
+    ]
+    for name, (style, marker) in zip(surveys, _SURVEYS, strict=True):
+        e = float(data["e_0"].sel(psf=name))
+        look = {"color": "0.35", "linestyle": style, "marker": marker, "markersize": 3.2}
+        entries.append((look, f"PSF of {name}, $e$ = {e:.3f}"))
+    entries.append(
+        ({"color": "0.6", "linewidth": 0.8}, f"scatter of {data.attrs['n_stars']} stars, Gaussian PSF")
+    )
+    entries.append(({"color": _RED, "linestyle": ":"}, f"requirement ({requirement.name})"))
+    handles = [axes[0, 0].plot([], [], **look)[0] for look, _ in entries]
+    labels = [label for _, label in entries]
+    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize=8.5)
