@@ -178,6 +178,69 @@ def test_predict_from_the_galaxy(porrima):
     assert 0.1 < json.loads(out)["removed_fraction"] < 0.3
 
 
+def test_predict_gives_intervals_covariance_and_quantiles(porrima, stars_file):
+    arguments = ["predict", "--stars", stars_file, "--mag", 18, 19, "--psf", "psf1", "--json"]
+    result = json.loads(porrima(*arguments, "--n-stars", 40)[1])
+    for name in ("eta", "bias_e1", "sigma_r2", "sd_e2"):
+        assert result[f"{name}_low"] <= result[name] <= result[f"{name}_high"]
+    assert result["covariance_e1_e1"] == pytest.approx(result["sd_e1"] ** 2)
+    quantiles = [row["dr2_rel"] for row in result["size_quantiles"]]
+    assert quantiles == sorted(quantiles)
+    assert 0 < result["quadrature_error"] < 1e-4
+    assert result["sources"][0]["change"] >= result["sources"][1]["change"]
+    crossed = json.loads(porrima(*arguments, "--n-stars", round(result["crossover_n_stars_r2"]))[1])
+    assert crossed["sd_r2"] == pytest.approx(crossed["bias_r2"], rel=0.02)
+    endless = json.loads(porrima(*arguments)[1])
+    assert endless["size_quantiles"] is None
+    assert endless["covariance_lnr2_lnr2"] == 0
+    weighted = json.loads(porrima(*arguments, "--n-stars", 40, "--stack-weight", "flux")[1])
+    assert weighted["eta_low"] is None
+    assert weighted["size_quantiles"] is None
+
+
+@pytest.mark.parametrize("instrument", ["euclid-vis", "rubin", "kcm16"])
+def test_a_budget_of_a_survey(porrima, stars_file, tmp_path, instrument):
+    arguments = ["budget", "--instrument", instrument, "--stars", stars_file, "--mag", 18, 20]
+    code, out, err = porrima(
+        *arguments, "--json", "-o", tmp_path / "shares.ecsv", "--plot", tmp_path / "shares.png"
+    )
+    assert code == 0, err
+    result = json.loads(out)
+    assert [(b["mag_lo"], b["mag_hi"]) for b in result["bins"]] == [(18, 19), (19, 20)]
+    assert len(result["shares"]) == 2 * 9
+    for row in result["shares"]:
+        assert row["total"] == pytest.approx(np.hypot(row["bias"], row["scatter"]))
+        assert (row["required"] is None) == (row["verdict"] is None)
+    assert (tmp_path / "shares.png").stat().st_size > 1000
+    assert len((tmp_path / "shares.ecsv").read_text().splitlines()) > 18
+    code, table, _ = porrima(*arguments)
+    assert code == 0
+    assert "18-19" in table
+
+
+def test_a_budget_takes_requirements_and_galaxies_from_files(porrima, stars_file, tmp_path):
+    (tmp_path / "mine.yaml").write_text("name: mine\nsigma_r2: 1e-3\nm: 2e-3\n")
+    (tmp_path / "galaxies.csv").write_text("half_light_radius,weight\n0.2,1\n0.4,3\n")
+    sizes = {}
+    for name in (
+        tmp_path / "galaxies.csv",
+        "{half_light_radius: 0.4}",
+        "{half_light_radius: 0.4, scatter: 0.1}",
+    ):
+        code, out, err = porrima(
+            "budget", "--requirements", tmp_path / "mine.yaml", "--stars", stars_file, "--mag", 18, 19, "--step", 0.5,
+            "--galaxies", name, "--psf", "psf0", "--json",
+        )  # fmt: skip
+        assert code == 0, err
+        result = json.loads(out)
+        assert (result["requirement"], result["required_m"], result["required_c"]) == ("mine", 2e-3, None)
+        assert len(result["bins"]) == 2
+        sizes[str(name)] = result["galaxy_inverse_r2"]
+    table, one, law = sizes.values()
+    assert table == pytest.approx(one * (0.25 * 4 + 0.75))
+    assert law == pytest.approx(one * np.exp(0.5 * (0.2 * np.log(10)) ** 2), rel=1e-6)
+
+
 def test_simulate_and_summary(porrima, config, tmp_path):
     store = tmp_path / "run.zarr"
     code, out, err = porrima("simulate", config, "-o", store, "--json")
@@ -216,6 +279,7 @@ def test_tables_are_printed_without_json(porrima, stars_file):
 
 PREDICT = ["predict", "--stars", "{stars}", "--mag", "18", "19", "--psf", "psf1"]
 GALAXY = ["stars", "--l", "180", "--b", "45"]
+BUDGET = ["budget", "--instrument", "kcm16", "--stars", "{stars}", "--mag", "18", "19"]
 WRONG = [  # arguments, what the one line says
     (["stars", "--catalog", "{missing_column}"], "missing.csv, column distance: must be in the table"),
     (["stars", "--catalog", "{truncated}"], "truncated.csv, row 3"),
@@ -240,6 +304,31 @@ WRONG = [  # arguments, what the one line says
     ([*PREDICT, "--cut", "0.5"], "--cut: is too wide for the kernel moments of this PSF"),
     ([*PREDICT, "--format", "table"], "--stars: cannot be given together with --format"),
     ([*PREDICT, "--multiplicity", "{{gap_rule: null}}"], "multiplicity: gap_rule must be lower or solar, got None"),
+    ([*BUDGET[:1], *BUDGET[3:]], "--instrument: must be one of euclid-vis, roman-h158, rubin, kcm16, massey13"),
+    (["budget", "--instrument", "euclid", *BUDGET[3:]], "(did you mean euclid-vis?), got euclid"),
+    ([*BUDGET, "--requirements", "{typo}"], "typo.yaml, sigma_r: is not a key (did you mean sigma_r2?)"),
+    ([*BUDGET, "--requirements", "{nothing}"], "must have at least one of sigma_e, sigma_r2, m, c"),
+    ([*BUDGET, "--requirements", "{broken}"], "broken.yaml, row 2: is not YAML"),
+    ([*BUDGET, "--requirements", "{below}"], "below.yaml, m: must be greater than 0, got -1"),
+    ([*BUDGET, "--requirements", "absent.yaml"], "absent.yaml: cannot be read (No such file or directory)"),
+    ([*BUDGET, "--galaxies", "{no_galaxies}"], "no_galaxies.csv, row 1: must have rows below its header"),
+    ([*BUDGET, "--galaxies", "{small}"], "column half_light_radius: must be positive and finite [arcsec], got -0.1"),
+    ([*BUDGET, "--galaxies", "{pairs}"], "column half_light_radius: is missing; the table has flux_ratio, dx, dy"),
+    ([*BUDGET, "--galaxies", "{{half_light_radius: -1}}"], "--galaxies, half_light_radius: must be greater than 0"),
+    ([*BUDGET, "--galaxies", "{{half"], "--galaxies: must be a table or {key: value, ...}, got {half"),
+    ([*BUDGET, "--galaxies", "{{half_light_radius: 0.1, smallest: 5}}"], "leaves no galaxies"),
+    ([*BUDGET, "--galaxy-size", "-0.3"], "--galaxy-size: must be positive and finite [arcsec], got -0.3"),
+    ([*BUDGET, "--galaxy-size", "1", "--galaxies", "x"], "--galaxy-size: cannot be given together with --galaxies"),
+    ([*BUDGET, "--n-stars", "0"], "--n-stars: must be at least 1, got 0"),
+    ([*BUDGET, "--binary-fraction", "-1"], "--binary-fraction: must be in [0, 1], got -1.0"),
+    ([*BUDGET, "--cut", "0.5"], "whose expansion stops being good at order 2, got 0.5"),
+    ([*BUDGET, "--mag", "18", "22"], "stars.csv, mag: no star with magnitude in [20, 21): choose other bins"),
+    ([*BUDGET, "--bins", "0"], "--bins: must be at least 1, got 0"),
+    ([*BUDGET, "--step", "0"], "--step: must be positive and finite [mag], got 0.0"),
+    ([*BUDGET, "--step", "1e-9"], "--step: must make at most 200 bins"),
+    ([*BUDGET, "--bins", "2", "--step", "1"], "--bins: cannot be given together with --step, got 2"),
+    ([*BUDGET, "--plot", "x.xyz", "-o", "y.ecsv"], "plot: must end in .png, .pdf, .svg, got x.xyz"),
+    ([*BUDGET, "--plot", "nowhere/x.png", "-o", "y.ecsv"], "output: cannot be written (No such folder)"),
     (["paper", "-o", "out", "--seed", "-1"], "seed: must be greater than or equal to 0, got -1"),
     (["bench", "--seed", "-1"], "seed: must be greater than or equal to 0, got -1"),
     ([*GALAXY, "--mag", "0", "inf"], "mag must be [lo, hi) with lo < hi, within -50 to 50"),
@@ -281,6 +370,12 @@ def test_wrong_input_gives_one_line_and_writes_nothing(
         "negative": ("negative.csv", "mass,distance,magnitude\n0.5,-100,18.5\n"),
         "pairs": ("pairs.csv", "flux_ratio,dx,dy\n2,0,0\n"),
         "wide": ("wide.csv", "flux_ratio,dx,dy\n1,0.1,0\n"),
+        "typo": ("typo.yaml", "sigma_e: 2e-4\nsigma_r: 1e-3\n"),
+        "nothing": ("nothing.yaml", "name: nothing\n"),
+        "broken": ("broken.yaml", "sigma_e: [1\n"),
+        "below": ("below.yaml", "m: -1\n"),
+        "no_galaxies": ("no_galaxies.csv", "half_light_radius\n"),
+        "small": ("small.csv", "half_light_radius\n0.3\n-0.1\n"),
         "config": ("run.yaml", CONFIG.format(stars=stars_file)),
         "misspelt": ("misspelt.yaml", CONFIG.format(stars=stars_file).replace("n_stars", "n_star")),
         "impossible": ("impossible.yaml", CONFIG.format(stars=stars_file) + "binary_fraction: 1.2\n"),

@@ -14,7 +14,16 @@ import yaml
 import porrima
 from porrima.catalogs import READERS
 from porrima.cli import app, main
-from porrima.config import Multiplicity, Photometry, RunConfig, StarsConfig, parse
+from porrima.config import (
+    GalaxiesConfig,
+    Multiplicity,
+    Photometry,
+    RequirementConfig,
+    RunConfig,
+    StarsConfig,
+    parse,
+)  # fmt: skip
+from porrima.instruments import SURVEYS
 from porrima.multiplicity import MULTIPLICITY
 from porrima.performance import BEGIN, END, with_tables
 from porrima.photometry import PHOTOMETRY, MainSequence
@@ -123,7 +132,8 @@ def test_every_json_key_is_documented(monkeypatch, capsys, tmp_path):
     )
     results = {
         "stars": ["--l", 180, "--b", 60, "--area", 0.2, "--mag", 18, 19, "-o", stars],
-        "predict": ["--stars", stars, "--mag", 18, 19, "--psf", "psf1"],
+        "predict": ["--stars", stars, "--mag", 18, 19, "--psf", "psf1", "--n-stars", 40],
+        "budget": ["--stars", stars, "--mag", 18, 19, "--instrument", "kcm16"],
         "measure": [pairs, "--psf", "psf1"],
         "simulate": [config, "-o", run],
         "summary": [run, "--bins", 1],
@@ -153,6 +163,11 @@ def test_every_key_of_the_configuration_is_documented():
     assert not {name for name in expected if f"`{name}`" not in table}
 
 
+def test_every_key_of_galaxies_and_requirements_is_documented():
+    expected = {*GalaxiesConfig.model_fields, *RequirementConfig.model_fields}
+    assert not {name for name in expected if f"`{name}`" not in section("budget")}
+
+
 def test_configurations_shown_are_valid():
     shown = [block for path in DOCUMENTS for block in fenced(path, "yaml")]
     assert shown
@@ -163,7 +178,7 @@ def test_configurations_shown_are_valid():
 def test_every_model_format_and_band_has_its_name_in_the_documents():
     text = COMMANDS.read_text(encoding="utf-8") + MODELS.read_text(encoding="utf-8")
     bands = {band for band in MainSequence().bands if not band.startswith("roman_")}
-    names = {*MULTIPLICITY, *PHOTOMETRY, *PSFS, *ESTIMATORS, *READERS, *bands}
+    names = {*MULTIPLICITY, *PHOTOMETRY, *PSFS, *ESTIMATORS, *READERS, *SURVEYS, *bands}
     assert not {name for name in names if f"`{name}`" not in text}
 
 
@@ -176,6 +191,39 @@ def test_the_headline_table_is_what_predict_gives(monkeypatch, capsys, model):
     line = f"predict --l 180 --b 45 --mag 18 19 --psf psf0 --binary-fraction 0.35 --multiplicity {model}"
     result = json_of(monkeypatch, capsys, *line.split())
     assert 1e4 * result["eta"] == pytest.approx(shown["18–19"], rel=0.02)
+
+
+@pytest.mark.parametrize("model", MULTIPLICITY)
+def test_the_budget_table_is_what_budget_gives(monkeypatch, capsys, model):
+    text = (ROOT / "docs" / "budget.md").read_text(encoding="utf-8").split("## The paper's own setting")[1]
+    table = text.split(f"`{model}`, requirement met at")[1]
+    cells = re.search(r"^\| 18–19 \|(.*)\|$", table, re.M)[1].split("|")
+    line = (
+        f"budget --instrument kcm16 --l 180 --b 45 --binary-fraction 0.35 --mag 18 19 --multiplicity {model}"
+    )
+    result = json_of(monkeypatch, capsys, *line.split())
+    size = next(row for row in result["shares"] if row["quantity"] == "r2")
+    (verdict,) = result["verdicts"]
+    shown = [float(cells[k].split("%")[0].split("(")[0]) for k in range(3)]
+    expected = [
+        1e4 * result["bins"][0]["eta"],
+        100 * size["total_share"],
+        100 * result["shares"][0]["total_share"],
+    ]
+    assert shown == pytest.approx(expected, rel=0.02)
+    assert cells[3].strip() == verdict["verdict"]
+
+
+@pytest.mark.parametrize(("name", "pixel"), [("optical1", None), ("roman:H158:SCA01", 0.11)])
+def test_the_table_of_psf_sizes_is_what_predict_gives(monkeypatch, capsys, name, pixel):
+    text = (ROOT / "docs" / "budget.md").read_text(encoding="utf-8")
+    label = {"optical1": "`optical1`", "roman:H158:SCA01": "Roman H158, pixel"}[name]
+    cells = re.search(rf"^\| {label} \|(.*)\|$", text, re.M)[1].split("|")
+    line = f"predict --l 180 --b 45 --mag 18 19 --binary-fraction 0.35 --psf {name}"
+    result = json_of(monkeypatch, capsys, *line.split(), *(["--pixel", pixel] if pixel else []))
+    assert [float(cells[2]), float(cells[3])] == pytest.approx(
+        [1e4 * result["eta"], 1e4 * result["bias_r2"]], rel=0.02
+    )
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "src" / "porrima").glob("*.py")), ids=lambda p: p.stem)

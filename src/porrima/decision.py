@@ -21,7 +21,7 @@ from porrima.galaxies import Galaxies, r2_of_half_light
 from porrima.instruments import REQUIREMENTS, SURVEYS, Requirement, Survey
 from porrima.io import read_galaxies
 from porrima.ledger import budget_answer
-from porrima.psf import psf_from_name
+from porrima.psf import GRID_PER_FWHM, psf_from_name
 from porrima.resolution import seen_by_regauss
 from porrima.response import response
 from porrima.sample import draw_stars
@@ -258,7 +258,8 @@ def _profile(
     }
     if survey.psf == "rubin":
         found = psf_from_name(str(RUBIN_PSF), **own)
-        return replace(found, name=found.name.replace(str(RUBIN_PSF), survey.psf))
+        grid = found.fwhm / GRID_PER_FWHM if found.grid is None else found.grid
+        return replace(found, name=found.name.replace(str(RUBIN_PSF), survey.psf), grid=grid)
     return psf_from_name(survey.psf, **own)
 
 

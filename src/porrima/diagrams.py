@@ -52,9 +52,9 @@ def budget_shares(answer: dict[str, Any]) -> Figure:
             axis.set(yscale="log", xlabel="magnitude", title=_TITLES[group])
             axis.legend(frameon=False, fontsize=8)
         axes[0].set_ylabel("share of the requirement")
-        highest = max(row["total_high"] / row["required"] for row in rows)
+        highest = max(row["total"] / row["required"] for row in rows)
         lowest = min(row["total"] / row["required"] for row in rows)
-        axes[0].set_ylim(max(1e-3, 0.4 * lowest), max(2.0, 1.5 * highest))
+        axes[0].set_ylim(max(1e-3, 0.4 * lowest), max(3.0, 3.0 * highest))
         figure.suptitle(f"{answer['requirement']}, {answer['n_stars']} stars", fontsize=9.5)
     return figure
 

@@ -213,6 +213,9 @@ def write_budget(answer: dict[str, Any], table: Path | None, picture: Path | Non
     """
     if picture is not None and picture.suffix not in FORMATS:
         raise InputError(f"must end in {', '.join(FORMATS)}", key="plot", value=picture)
+    for path in (table, picture):  # before either is written
+        if path is not None and not path.parent.is_dir():
+            raise InputError("cannot be written (No such folder)", key="output", value=path)
     if table is not None:
         empty = {"required": math.nan, "verdict": ""}
         rows = [

@@ -17,7 +17,7 @@ GROUPS = {"psf": QUANTITIES, "fit": ("m", "c1", "c2"), "moments": ("m", "c1", "c
 """What is measured, by who measures it: shape of the PSF; shear by a method that fits, or that subtracts moments."""
 
 VERDICTS = ("within", "uses all", "exceeds")
-"""Whole interval of the total below the requirement; the requirement in it; whole interval above."""
+"""Whole interval of the total below the requirement; the requirement in it, or an end unknown; whole interval above."""
 
 
 class Interval(NamedTuple):
@@ -87,7 +87,11 @@ class Share:
     def verdict(self) -> str | None:
         """One of `VERDICTS`; None where nothing is required."""
         share = self.share
-        return None if share is None else VERDICTS[int(share.high > 1) + int(share.low > 1)]
+        if share is None:
+            return None
+        return VERDICTS[
+            int(not share.high <= 1) + int(share.low > 1)
+        ]  # an end that is not known may be anywhere
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -191,7 +195,9 @@ def stars_needed(bias: float, spread: float, required: float) -> float:
     Returns
     -------
     n_stars : float
-        At least 1; infinite where the bias alone exceeds the requirement (count).
+        At least 1; infinite where the bias alone exceeds the requirement, NaN where a number is (count).
     """
     room = required**2 - bias**2
+    if math.isnan(room) or math.isnan(spread):
+        return math.nan
     return float(max(1, math.ceil(spread**2 / room))) if room > 0 else math.inf
