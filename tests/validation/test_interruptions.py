@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -27,10 +28,15 @@ MEMORY = (
 MEMORY_LIMIT = 600  # MB
 
 
-def command(*arguments, output=subprocess.PIPE, **options):
-    code = "from porrima.cli import main; main()"
+MAIN = "from porrima.cli import main; main()"
+WITH_PEAK = (
+    "import atexit, sys; atexit.register(lambda: sys.stderr.write(open('/proc/self/status').read())); " + MAIN
+)
+
+
+def command(*arguments, code=MAIN, **options):
     words = [sys.executable, "-c", code, *map(str, arguments), "--json"]
-    return subprocess.Popen(words, stdout=output, stderr=output, text=True, **options)
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
 def done(process):
@@ -132,12 +138,11 @@ def test_killed_workers_and_a_killed_client_change_no_byte(whole, tmp_path, reco
 
 
 def peak(*arguments):
-    """Largest resident size of a command, in MB."""
-    process = command(*arguments, output=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = status
-    assert status == 0
-    return usage.ru_maxrss / 1024
+    """Largest resident size of a command since it was started, in MB."""
+    process = command(*arguments, code=WITH_PEAK)
+    _, err = process.communicate()
+    assert process.returncode == 0
+    return int(re.search(r"VmHWM:\s*(\d+) kB", err)[1]) / 1024
 
 
 def test_memory_does_not_grow_with_the_number_of_stacks(tmp_path, record):
