@@ -31,6 +31,7 @@ Result = TypeVar("Result")
 _AHEAD = 2  # tasks given out per worker, so that none waits for the next one; bounds what is held in memory
 _TOGETHER = 16  # results fetched in one message
 _RECOUNT = 5.0  # s between two looks at how many workers there are
+_GO_ON = "what is written is whole: go on with --resume"
 _ALONE = threading.Lock()  # one task at a time takes all threads of a worker
 
 
@@ -113,22 +114,29 @@ class Cluster:
 
     def _count(self) -> int:
         """Number of workers, 1 at least."""
-        return max(1, len(self.client.nthreads()))
+        try:
+            return max(1, len(self.client.nthreads()))
+        except OSError as error:
+            raise self._gone(error) from None
 
     def _result(self, future: Any, some: tuple[int, int]) -> Any:
         from dask.distributed import CancelledError, KilledWorker  # noqa: PLC0415  (an extra)
 
-        rest = "what is written is whole: go on with --resume"
         try:
             return future.result()
         except KilledWorker as error:
-            message = f"{error.allowed_failures + 1} workers died, one after the other, of stacks"
-            raise RunError(f"{self.address}: {message} {some[0]} to {some[1] - 1}; {rest}") from None
+            message = (
+                f"{error.allowed_failures + 1} workers died with stacks {some[0]} to {some[1] - 1} in hand"
+            )
+            raise RunError(f"{self.address}: {message}; {_GO_ON}") from None
         except (CancelledError, TimeoutError, OSError) as error:
-            raise RunError(f"{self.address}: is gone ({type(error).__name__}); {rest}") from None
+            raise self._gone(error) from None
         except ImportError as error:
             rule = f"must have Porrima on its scheduler and workers ({error})"
             raise InputError(rule, key="scheduler", value=self.address) from None
+
+    def _gone(self, error: BaseException) -> RunError:
+        return RunError(f"{self.address}: is gone ({type(error).__name__}); {_GO_ON}")
 
 
 @contextmanager
@@ -162,16 +170,18 @@ def cluster(workers: int | None, scheduler: str | None) -> Iterator[Cluster | No
         return
     try:
         from dask.distributed import Client  # noqa: PLC0415  (an extra)
+        from distributed.utils import silence_logging_cmgr  # noqa: PLC0415
     except ImportError:
         raise InputError("needs Dask: install porrima[cluster]", key="workers") from None
     with ExitStack() as stack:
+        stack.enter_context(silence_logging_cmgr(logging.CRITICAL))  # what goes wrong is said in one line
         try:
             where = stack.enter_context(_local(workers or 1)) if scheduler is None else scheduler
             client = stack.enter_context(Client(where, timeout="10s"))
+            if not client.nthreads():
+                warnings.warn(f"{scheduler} has no workers yet: waiting for one", stacklevel=3)
         except (OSError, ValueError, ImportError) as error:  # ImportError: of an unknown protocol, say
             raise InputError(f"cannot be reached ({error})", key="scheduler", value=scheduler) from None
-        if not client.nthreads():
-            warnings.warn(f"{scheduler} has no workers yet: waiting for one", stacklevel=3)
         yield Cluster(client=client, address=client.scheduler.address)
 
 
