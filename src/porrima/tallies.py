@@ -75,7 +75,7 @@ class Tally:
         Parameters
         ----------
         values : (n_psf, 3, 8, n_bin) float array
-            In the order of `STATISTICS`, dimensionless; with axes before it where there are several tallies.
+            In the order of `STATISTICS`, dimensionless; with an axis before these where there are several tallies.
 
         Returns
         -------
