@@ -26,4 +26,4 @@ paper: .venv/installed
 	$(BIN)/porrima paper --output paper
 
 clean:
-	rm -rf .venv paper build dist
+	rm -rf .venv paper build dist src/porrima/__pycache__ .numba_cache

@@ -34,6 +34,12 @@ def record(request):
     return keep
 
 
+@pytest.fixture(scope="session")
+def full_size(request):
+    """Whether the page is written: the longest checks are then at the size that it quotes, and shorter otherwise."""
+    return request.config.getoption("--write-validation")
+
+
 def _number(section):
     """Headings begin with their place on the page."""
     number, letter = re.match(r"(\d+)(\w*)", section[0]).groups()

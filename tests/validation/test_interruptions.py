@@ -75,11 +75,11 @@ def whole(tmp_path_factory):
     return folder, first
 
 
-def test_twenty_kills_at_random_moments_of_a_run_change_no_byte(whole, tmp_path, record):
-    folder, first = whole
+def test_kills_at_random_moments_of_a_run_change_no_byte(whole, full_size, tmp_path, record):
+    (folder, first), kills = whole, KILLS if full_size else KILLS // 4
     path, rng = tmp_path / "run.zarr", np.random.Generator(np.random.Philox(20261123))
     lost, at_work = [], 0
-    for _ in range(KILLS):
+    for _ in range(kills):
         before = len(chunks(path, "tally"))
         process = command("simulate", folder / "run.yaml", "-o", path, "--chunk", CHUNK, "--resume")
         if rng.uniform() < 1 / 3:
@@ -104,7 +104,7 @@ def test_twenty_kills_at_random_moments_of_a_run_change_no_byte(whole, tmp_path,
         "most chunks lost by one",
         "bytes that differ",
     ]
-    record(KILLED, columns, ["the command", KILLS, at_work, max(lost), 0])
+    record(KILLED, columns, ["the command", kills, at_work, max(lost), 0])
 
 
 def test_killed_workers_and_a_killed_client_change_no_byte(whole, tmp_path, record):
