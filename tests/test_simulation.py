@@ -160,14 +160,14 @@ def wait_for_chunks(path, n, process):
         time.sleep(0.005)
 
 
-@pytest.fixture
-def long_run(tmp_path):
+@pytest.fixture(scope="module")
+def long_run(tmp_path_factory):
     """Configuration of some hundred chunks, and what an uninterrupted run makes of it."""
-    file = tmp_path / "run.yaml"
-    config = small(n_stacks=10_000, psf="psf0", estimator="plain")
-    file.write_text(canonical(config))
-    simulate(load(file), tmp_path / "whole.zarr", chunk=25)
-    return file, tmp_path / "whole.zarr"
+    folder = tmp_path_factory.mktemp("long")
+    config = small(n_stacks=5000, psf="psf0", estimator="plain")
+    (folder / "run.yaml").write_text(canonical(config))
+    simulate(config, folder / "whole.zarr", chunk=25)
+    return folder / "run.yaml", folder / "whole.zarr"
 
 
 def test_kills_at_random_moments_of_a_run_change_no_byte(long_run, tmp_path):
@@ -175,7 +175,7 @@ def test_kills_at_random_moments_of_a_run_change_no_byte(long_run, tmp_path):
     path, rng = tmp_path / "run.zarr", np.random.Generator(np.random.Philox(5))
     for kill in range(4):
         process = started(file, path, "--chunk", "25")
-        wait_for_chunks(path, 60 * kill + 20, process)
+        wait_for_chunks(path, 30 * kill + 20, process)
         time.sleep(rng.uniform(0, 0.05))
         process.kill()
         process.communicate()
@@ -184,7 +184,7 @@ def test_kills_at_random_moments_of_a_run_change_no_byte(long_run, tmp_path):
     process = started(file, path)
     out, err = process.communicate()
     assert process.returncode == 0, err
-    assert 0 < json.loads(out)["n_stacks_computed"] <= 10_000 - 25 * 200
+    assert 0 < json.loads(out)["n_stacks_computed"] <= 5000 - 25 * 110
     assert contents(path) == contents(whole)
 
 
