@@ -198,7 +198,7 @@ def _uniform_fractions(seed, first, fractions):  # type: ignore[no-untyped-def]
         fractions[s] = uniform_pair(words[0], words[1])
 
 
-@njit(forceinline=True, _nrt=False)
+@njit(forceinline=True, _nrt=False, cache=True)
 def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, listed):  # type: ignore[no-untyped-def]
     """Sum of the weights of one stack, with those of its moments, in the unit of length, in `sums`.
 
