@@ -36,6 +36,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "roman": {"errors", "sampling", "spectra"},
     "psf_files": {"errors"},
     "psf": {"errors", "optics", "psf_files", "roman", "sampling", "spectra"},
+    "passbands": {"errors", "photometry", "roman"},
     "shapes": {"errors"},
     "stamps": {"shapes"},
     "weighted": {"moments", "shapes", "stamps"},
@@ -63,6 +64,10 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     },
     "uncertainty": {
         "averages", "integrals", "multiplicity", "photometry", "prediction", "response", "stars", "systems",
+    },
+    "colour": {
+        "errors", "integrals", "passbands", "photometry", "psf", "psf_files", "reach", "roman", "shapes", "spectra",
+        "stars", "systems",
     },
     "galaxies": {"errors", "units"},
     "shear": {"averages", "errors", "galaxies", "moments", "prediction", "shapes"},
@@ -106,23 +111,25 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "performance": {"figures", "files", "io"},
     "terminal": set(),
     "answers": {
-        "catalogs", "config", "distribution", "errors", "gaia", "integrals", "prediction", "response", "sample",
-        "stars", "systems", "uncertainty",
+        "catalogs", "colour", "config", "distribution", "errors", "gaia", "integrals", "prediction", "response",
+        "sample", "stars", "systems", "uncertainty",
     },
     "ledger": {"budget", "diagrams", "errors", "galaxies", "io", "shares"},
     "decision": {
-        "answers", "budget", "config", "deconvolution", "errors", "galaxies", "instruments", "io", "ledger",
-        "psf", "resolution", "response", "sample", "shapes", "stars",
+        "answers", "budget", "colour", "config", "deconvolution", "errors", "galaxies", "instruments", "integrals",
+        "io", "ledger", "psf", "resolution", "response", "sample", "shapes", "stars",
     },
     "cli": {
-        "answers", "bench", "catalogs", "config", "decision", "errors", "experiments", "figures", "files", "gaia",
-        "images", "io", "kappa", "ledger", "machine", "measurement", "performance", "prediction", "psf", "report",
-        "response", "sample", "shapes", "simulation", "star_figures", "store", "summary", "systems", "terminal", "toy",
+        "answers", "bench", "catalogs", "colour", "config", "decision", "errors", "experiments", "figures", "files",
+        "gaia", "images", "io", "kappa", "ledger", "machine", "measurement", "performance", "prediction", "psf",
+        "report", "response", "sample", "shapes", "simulation", "star_figures", "store", "summary", "systems",
+        "terminal", "toy",
     },
 }  # fmt: skip
 NEVER_REACHED = {  # followed through every module in between
     "prediction": {"stack", "simulation"},
     "deconvolution": {"stack", "simulation"},
+    "colour": {"stack", "simulation"},
     "distribution": {"stack", "simulation"},
     "uncertainty": {"stack", "simulation"},
     "images": {"response", "weighted", "stack", "prediction"},

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
+from porrima.colour import colour_bias, in_band, integrals_in_band
 from porrima.config import PopulationConfig, parse
 from porrima.distribution import size_distribution
 from porrima.errors import InputError
@@ -22,15 +23,20 @@ from porrima.uncertainty import NAMES, uncertainty
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from numpy.typing import NDArray
+
     from porrima.catalogs import Catalog
+    from porrima.colour import Chromatic
     from porrima.integrals import PairIntegrals
     from porrima.prediction import Prediction
     from porrima.response import Response
     from porrima.stars import Stars
     from porrima.systems import Population
 
+    FloatArray = NDArray[np.float64]
+
 __all__ = [
-    "COUNT_COLUMNS", "NUMBER_COLUMNS", "PREDICTED_COLUMNS", "count_lines", "gaia_cone", "number_lines",
+    "COUNT_COLUMNS", "NUMBER_COLUMNS", "PREDICTED_COLUMNS", "colour_answer", "count_lines", "gaia_cone", "number_lines",
     "population_config", "predicted", "predicted_lines", "stars_answer",
 ]  # fmt: skip
 
@@ -132,7 +138,11 @@ def _model_with_options(name: str, text: str) -> Any:
 
 
 def predicted(
-    config: PopulationConfig, reply: Response, binary_fraction: float | None, n_stars: int | None
+    config: PopulationConfig,
+    reply: Response,
+    binary_fraction: float | None,
+    n_stars: int | None,
+    waves: Chromatic | None = None,
 ) -> dict[str, Any]:
     """What `predict` shows.
 
@@ -146,6 +156,8 @@ def predicted(
         In [0, 1]; None for the model's own.
     n_stars : int or None
         In the stack (count); None for infinitely many.
+    waves : Chromatic, optional
+        What the wavelength does to the PSF, where the colour of companions is asked for.
 
     Returns
     -------
@@ -196,7 +208,48 @@ def predicted(
         **_spread(prediction),
         "quadrature_error": moments.relative_error[0],
         **known,
+        **colour_answer(config, population, integrals, waves, float(reply.shape0.r2), fraction),
     }
+
+
+def colour_answer(
+    config: PopulationConfig,
+    population: Population,
+    integrals: PairIntegrals,
+    waves: Chromatic | None,
+    r2_0: float,
+    binary_fraction: FloatArray | None,
+) -> dict[str, Any]:
+    """What the colour of companions does, beside what their separation does with flux ratios of the same band.
+
+    Parameters
+    ----------
+    config : PopulationConfig
+        Its photometry enters.
+    population : Population
+        The stars, in the band of their selection.
+    integrals : PairIntegrals
+        Of the same stars, dimensionless.
+    waves : Chromatic or None
+        Where None nothing is asked for.
+    r2_0 : float
+        Size of the PSF, in arcsec².
+    binary_fraction : (1,) float array or None
+        In [0, 1]; None for the model's own.
+
+    Returns
+    -------
+    answer : dict
+        Dimensionless; all None where nothing is asked for.
+    """
+    if waves is None:
+        return dict.fromkeys(COLOUR_KEYS)
+    here = in_band(population, config.photometry.build(), waves.band.name)
+    of_pairs = integrals_in_band(here, integrals)
+    found = colour_bias(here, waves, of_pairs, binary_fraction)
+    eta = population_moments(here, of_pairs, binary_fraction).mean_x[0] / r2_0
+    values = waves.band.name, waves.slope[2], eta, found.blind[2, 0], found.known[2, 0]
+    return dict(zip(COLOUR_KEYS, values, strict=True))
 
 
 def _spread(prediction: Prediction) -> dict[str, float]:
@@ -268,7 +321,7 @@ def predicted_lines(answer: dict[str, Any]) -> list[list[Any]]:
     ends = ("_low", "_high")
     lines = []
     for key, value in answer.items():
-        if isinstance(value, list) or key.endswith(ends):
+        if isinstance(value, list) or key.endswith(ends) or (value is None and key in COLOUR_KEYS):
             continue
         known = [answer.get(key + end) for end in ends]
         lines.append([key, value, *("" if end is None else end for end in known)])
@@ -280,6 +333,9 @@ def predicted_lines(answer: dict[str, Any]) -> list[list[Any]]:
 
 
 PREDICTED_COLUMNS = ["quantity", "value", "low", "high"]
+
+COLOUR_KEYS = ("colour_band", "colour_slope", "colour_eta", "colour_r2", "colour_r2_known")
+"""Of what the colour of companions does: null where it is not asked for."""
 
 PROBABILITIES = (0.05, 0.16, 0.5, 0.84, 0.95, 0.99)
 """At which the size change of a stack is given (dimensionless)."""

@@ -58,6 +58,9 @@ PixelScale = Annotated[float | None, typer.Option("--pixel-scale", help="Of a FI
 Jitter = Annotated[
     float | None, typer.Option("--jitter", help="Sigma of a Gaussian to convolve with [arcsec].")
 ]
+Colour = Annotated[
+    str | None, typer.Option("--colour", help="Band of the PSF: adds what the companions' colour does.")
+]
 EstimatorName = Annotated[
     str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")
 ]
@@ -165,11 +168,13 @@ def predict(
     band: Band = None,
     cut: Annotated[float, typer.Option(help="Separation from which a pair is resolved [arcsec].")] = 0.05,
     stack_weight: Annotated[str, typer.Option(help="equal, or flux.")] = "equal",
+    colour: Colour = None,
     seed: Seed = 1,
     as_json: Json = False,
 ) -> None:
     """Bias and error of the PSF's shape in closed form."""
     from porrima.answers import PREDICTED_COLUMNS, population_config, predicted, predicted_lines
+    from porrima.colour import chromatic
     from porrima.psf import psf_from_name
     from porrima.response import response
     from porrima.shapes import estimator_from_name
@@ -184,8 +189,9 @@ def predict(
         multiplicity=multiplicity, photometry=photometry, cut=cut, stack_weight=stack_weight,
     )  # fmt: skip
     profile = psf_from_name(psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter)
-    reply = response(profile, estimator_from_name(estimator))
-    result = predicted(config, reply, binary_fraction, n_stars)
+    method = estimator_from_name(estimator)
+    waves = chromatic(psf, method, colour, pixel=pixel, jitter=jitter) if colour else None
+    result = predicted(config, response(profile, method), binary_fraction, n_stars, waves)
     header = f"{result['n_catalog_stars']} stars, {psf}, {estimator}, {multiplicity}"
     show(result, as_json, header, PREDICTED_COLUMNS, predicted_lines(result))
 
@@ -226,6 +232,7 @@ def budget(
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
     cut: Annotated[float | None, typer.Option(help="Separation of resolved pairs [arcsec].")] = None,
+    colour: Colour = None,
     seed: Seed = 1,
     plot: Annotated[Path | None, typer.Option(help="Picture to write: PNG, PDF or SVG.")] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")] = None,
@@ -240,7 +247,7 @@ def budget(
         instrument=instrument, requirements=requirements, galaxy_size=galaxy_size, galaxies=galaxies, mag=mag,
         bins=bins, step=step, psf=psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter, estimator=estimator,
         n_stars=n_stars, binary_fraction=binary_fraction, cut=cut, l=l, b=b, catalog=catalog, format=format, map=map,
-        options=options, band=band, seed=seed, multiplicity=multiplicity, photometry=photometry,
+        options=options, band=band, colour=colour, seed=seed, multiplicity=multiplicity, photometry=photometry,
     )  # fmt: skip
     write_budget(result, output, plot)
     show(result, as_json, header_of(result, multiplicity), BUDGET_COLUMNS, budget_lines(found))

@@ -12,25 +12,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from porrima.answers import population_config
+from porrima.answers import COLOUR_KEYS, colour_answer, population_config
 from porrima.budget import Setting, budget
+from porrima.colour import chromatic
 from porrima.config import GalaxiesConfig, known, load_requirement, parse
 from porrima.deconvolution import fit_response
 from porrima.errors import InputError
 from porrima.galaxies import Galaxies, r2_of_half_light
 from porrima.instruments import REQUIREMENTS, SURVEYS, Requirement, Survey
+from porrima.integrals import integrate
 from porrima.io import read_galaxies
 from porrima.ledger import budget_answer
 from porrima.psf import GRID_PER_FWHM, psf_from_name
 from porrima.resolution import seen_by_regauss
 from porrima.response import response
-from porrima.sample import draw_stars
+from porrima.sample import draw_stars, population_of
 from porrima.shapes import Adaptive, Plain, estimator_from_name
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from porrima.budget import Budget
+    from porrima.colour import Chromatic
     from porrima.config import PopulationConfig
     from porrima.psf import PSF
     from porrima.shapes import Estimator
@@ -187,6 +190,7 @@ def decided(
     n_stars: int,
     binary_fraction: float | None,
     cut: float | None,
+    colour: str | None = None,
     **options: Any,
 ) -> tuple[dict[str, Any], Budget]:
     """Budget from the options of the command.
@@ -203,6 +207,8 @@ def decided(
         From which the PSF of a patch is made (count).
     binary_fraction : float or None
         In [0, 1]; None for the model's own.
+    colour : str or None
+        Band in which the PSF is formed, where the colour of companions is asked for.
     options : dict
         Of `answers.population_config`.
 
@@ -225,6 +231,11 @@ def decided(
     config = population_config(**options, mag=mag, cut=survey.cut if cut is None else cut)
     method = estimator_from_name(estimator)
     profile = _profile(survey, psf, pixel, pixel_scale, jitter)
+    waves = None
+    if colour is not None:
+        own = (survey.pixel, survey.jitter) if psf is None else (None, None)
+        blur = {"pixel": pixel or own[0], "jitter": jitter or own[1]}
+        waves = chromatic(psf or survey.psf, method, colour, **blur)
     parts = _stars_of(config, ranges)
     setting = Setting(
         requirement=requirement,
@@ -242,7 +253,22 @@ def decided(
         found = budget(setting, parts)
     for one in {str(one.message): one for one in said}.values():  # each bin says the same
         warnings.warn(one.message, stacklevel=2)
-    return budget_answer(found, profile.name, estimator, sizes), found
+    answer = budget_answer(found, profile.name, estimator, sizes)
+    for row, (_, stars) in zip(answer["bins"], parts, strict=True):
+        row |= _colours(config, stars, waves, setting)
+    return answer, found
+
+
+def _colours(
+    config: PopulationConfig, stars: Stars, waves: Chromatic | None, setting: Setting
+) -> dict[str, Any]:
+    """What the colour of the companions of a bin does; None where it is not asked for."""
+    if waves is None:
+        return dict.fromkeys(COLOUR_KEYS)
+    population = population_of(config, stars)
+    fraction = None if setting.binary_fraction is None else np.array([setting.binary_fraction])
+    r2_0 = float(setting.response.shape0.r2)
+    return colour_answer(config, population, integrate(population), waves, r2_0, fraction)
 
 
 def _profile(

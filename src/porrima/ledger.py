@@ -183,11 +183,19 @@ def header_of(answer: dict[str, Any], multiplicity: str) -> str:
         for name in ("sigma_e", "sigma_r2", "m", "c")
         if answer[f"required_{name}"] is not None
     ]
+    coloured = "".join(
+        f"\n{row['mag_lo']:g}-{row['mag_hi']:g}, companions' colour in {row['colour_band']}: size "
+        f"{row['colour_r2']:+.1e}, {row['colour_r2_known']:+.1e} where the PSF follows the star's colour, "
+        f"eta {row['colour_eta']:.1e}"
+        for row in answer["bins"]
+        if row.get("colour_band")
+    )
     return (
         f"{answer['requirement']}: {', '.join(limits)} ({answer['source']})\n"
         f"{answer['psf']}, {answer['estimator']}, {multiplicity}, cut {answer['cut']:g} arcsec, "
         f"{answer['n_stars']} stars for the PSF of a patch\n"
         "cells: bias / rms error, in percent of the requirement; psf: its shape; fit, moments: shear by that method"
+        + coloured
     )
 
 

@@ -21,6 +21,10 @@ __all__ = ["PHOTOMETRY", "HabetsHeintze1981", "MainSequence", "MassLuminosity", 
 STEP = 0.0025
 """Spacing in log10 mass of the tabulated tracks (dimensionless)."""
 
+_BELOW = {"log_teff": -0.03}
+"""Step of a column from 0.09 to 0.08 M_sun where it is not that of magnitudes, 1.73 mag: for the temperature, in dex,
+about that from 0.10 to 0.09 M_sun."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tracks:
@@ -294,10 +298,38 @@ class MainSequence:
         ValueError
             If the band is unknown or a mass lies outside `mass_range`.
         """
-        check_masses(mass, self.mass_range, "main-sequence")
         if band not in self.bands:
             raise ValueError(f"band must be one of {', '.join(self.bands)}, got {band}")
-        grid, turn_off, mh, age = _main_sequence_grid(band)
+        return self._tracks(mass, metallicity, log_age, band)
+
+    def temperature_tracks(self, mass: FloatArray, metallicity: FloatArray, log_age: FloatArray) -> Tracks:
+        """Tracks of the effective temperature and the place in them of each star.
+
+        Parameters
+        ----------
+        mass : (n,) float array
+            In M_sun.
+        metallicity : (n,) float array
+            [M/H], in dex.
+        log_age : (n,) float array
+            log10 of the age in yr.
+
+        Returns
+        -------
+        tracks : Tracks
+            As `tracks`, with log10 of the temperature in K for `magnitude`.
+
+        Raises
+        ------
+        ValueError
+            If a mass lies outside `mass_range`.
+        """
+        return self._tracks(mass, metallicity, log_age, "log_teff")
+
+    def _tracks(self, mass: FloatArray, metallicity: FloatArray, log_age: FloatArray, column: str) -> Tracks:
+        """Tracks of one column of the table."""
+        check_masses(mass, self.mass_range, "main-sequence")
+        grid, turn_off, mh, age = _main_sequence_grid(column)
         j, wj = _bracket(mh, metallicity)
         turn_off_star = (1 - wj)[:, None] * turn_off[j] + wj[:, None] * turn_off[j + 1]
         k, wk = _bracket(10.0**age, 10.0 ** np.minimum(log_age, _oldest(turn_off_star, age, mass)))
@@ -392,7 +424,7 @@ def _main_sequence_grid(band: str) -> tuple[FloatArray, FloatArray, FloatArray, 
                 mass = np.concatenate([[0.09], mass])
                 magnitude = np.concatenate([[magnitude[0] + solar[0] - solar[1]], magnitude])
             mass = np.concatenate([[0.08], mass])
-            magnitude = np.concatenate([[magnitude[0] + 1.73], magnitude])
+            magnitude = np.concatenate([[magnitude[0] + _BELOW.get(band, 1.73)], magnitude])
             x = np.log10(mass)
             slope = (magnitude[-1] - magnitude[-2]) / (x[-1] - x[-2])
             beyond = magnitude[-1] + slope * (log_mass - x[-1])
