@@ -11,6 +11,7 @@ import xarray as xr
 
 from porrima import cli
 from porrima.catalogs import read_catalog
+from porrima.diagrams import colour_against_eta
 from porrima.errors import RunError
 
 PREDICT_KEYS = {
@@ -196,6 +197,35 @@ def test_predict_gives_intervals_covariance_and_quantiles(porrima, stars_file):
     weighted = json.loads(porrima(*arguments, "--n-stars", 40, "--stack-weight", "flux")[1])
     assert weighted["eta_low"] is None
     assert weighted["size_quantiles"] is None
+
+
+def test_the_colour_of_companions_comes_only_where_asked_for(porrima, stars_file, tmp_path):
+    blur = ["--psf", "optical1", "--pixel", 0.1, "--jitter", 0.029]
+    where = ["--stars", stars_file, "--mag", 18, 19]
+    plain = json.loads(porrima("predict", *where, *blur, "--json")[1])
+    coloured = json.loads(porrima("predict", *where, *blur, "--colour", "euclid_VIS", "--json")[1])
+    names = [name for name in plain if name.startswith("colour_")]
+    assert len(names) == 5
+    assert all(plain[name] is None for name in names)
+    assert all(coloured[name] == plain[name] for name in plain if name not in names)
+    assert coloured["colour_band"] == "euclid_VIS"
+    assert 0.3 < coloured["colour_r2"] / coloured["colour_eta"] < 2
+    assert abs(coloured["colour_r2_known"]) < 0.1 * coloured["colour_r2"]
+    budget = ["budget", "--instrument", "euclid-vis", *where, "--colour", "euclid_VIS"]
+    code, out, err = porrima(*budget, "--json")
+    assert code == 0, err
+    result = json.loads(out)
+    (row,) = result["bins"]
+    assert [row[name] for name in names] == pytest.approx([coloured[name] for name in names])
+    figure = colour_against_eta({"Euclid VIS": result})
+    (axis,) = figure.axes
+    drawn = [float(y) for line in axis.lines for y in line.get_ydata()]
+    assert row["colour_r2"] in drawn
+    _, out, _ = porrima(*budget)
+    assert "companions' colour in euclid_VIS" in out
+    code, out, err = porrima("predict", *where, "--psf", "psf1", "--colour", "euclid_VIS")
+    assert code == 2
+    assert err.strip().endswith("error: colour: needs an optical, Roman or chromatic PSF, got psf1")
 
 
 @pytest.mark.parametrize("instrument", ["euclid-vis", "rubin", "kcm16"])

@@ -234,7 +234,7 @@ def decided(
     waves = None
     if colour is not None:
         own = (survey.pixel, survey.jitter) if psf is None else (None, None)
-        blur = {"pixel": pixel or own[0], "jitter": jitter or own[1]}
+        blur: dict[str, Any] = {"pixel": pixel or own[0], "jitter": jitter or own[1]}
         waves = chromatic(psf or survey.psf, method, colour, **blur)
     parts = _stars_of(config, ranges)
     setting = Setting(

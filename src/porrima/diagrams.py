@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from porrima.instruments import Requirement
 
-__all__ = ["against_magnitude", "budget_shares"]
+__all__ = ["against_magnitude", "budget_shares", "colour_against_eta"]
 
 _RED = "#b00020"
 _TITLES = {"psf": "shape of the PSF", "fit": "shear, fit", "moments": "shear, moments"}
@@ -71,6 +71,50 @@ def _share_line(axis: Any, rows: list[dict[str, Any]], colour: str) -> None:
         [row["bias_share"] for row in rows], edges, color=colour, linewidth=1.0, linestyle=":", baseline=None
     )
 
+
+def colour_against_eta(answers: dict[str, dict[str, Any]]) -> Figure:
+    """What the colour of companions does to the size of the PSF, beside what their separation does.
+
+    Parameters
+    ----------
+    answers : dict
+        Title of a panel: as `porrima budget --colour BAND --json` prints it; dimensionless against mag.
+
+    Returns
+    -------
+    figure : Figure
+        Open symbols are negative changes; the dashed line is the requirement.
+    """
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(7.4, 3.6), layout="constrained")
+        axes = figure.subplots(1, len(answers), sharey=True, squeeze=False)[0]
+        for axis, (title, answer) in zip(axes, answers.items(), strict=True):
+            bins = answer["bins"]
+            middle = [0.5 * (row["mag_lo"] + row["mag_hi"]) for row in bins]
+            for key, label, colour, marker in _COLOUR_LINES:
+                values = [row[key] for row in bins]
+                axis.plot(middle, [abs(v) for v in values], color=colour, linewidth=1.0, linestyle=":")
+                for sign, fill in ((1, colour), (-1, "white")):
+                    here = [(m, sign * v) for m, v in zip(middle, values, strict=True) if sign * v > 0]
+                    if here:
+                        look = {"markeredgecolor": colour, "markerfacecolor": fill, "markersize": 4.5}
+                        axis.plot(*zip(*here, strict=True), linestyle="", marker=marker, **look)
+                axis.plot([], [], color=colour, linestyle=":", marker=marker, markersize=4.5, label=label)
+            if answer["required_sigma_r2"] is not None:
+                axis.axhline(answer["required_sigma_r2"], color=_RED, linestyle="--", linewidth=1.0)
+            axis.set(yscale="log", xlabel="$i$ [mag]", title=title)
+        axes[0].set_ylabel(r"$|\delta R^2| / R_0^2$")
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=8.5)
+    return figure
+
+
+_COLOUR_LINES = (
+    ("eta", r"$\eta$, flux ratios in $i$", "0.55", "s"),
+    ("colour_eta", r"$\eta$, flux ratios in the band of the PSF", COLOURS[0], "o"),
+    ("colour_r2", "colour of companions, PSF model blind to colour", COLOURS[1], "D"),
+    ("colour_r2_known", "colour of companions, PSF model of the star's colour", COLOURS[2], "^"),
+)
 
 _ROWS = (
     ("mean_x", r"$\langle x \rangle$ [arcsec$^2$]", (1e-7, 3e-5)),
