@@ -58,11 +58,12 @@ MOST_TRIES = 10_000
 class Tables(NamedTuple):
     """A population as the compiled loops read it: everything that one pair needs stands in three rows of 32 bytes.
 
-    A star has the mean of log2(a/d), log2 of the mass that the mass ratio multiplies (the primary's, or
-    the companion's where it is given), log2 of the primary's flux, the weights of the second to fourth of its tracks,
-    and the first row of its group of tracks and that of its law (as bits).  A law has the scatter of log2 a, the
-    cumulative probability of the longest axis, the three numbers of the mass ratio (see `companion_mass`), the
-    multiplicity fraction.  A track row has log2 of the flux on the four tracks of a group at one mass and at the next.
+    A star has a row for each class of its companions: the mean of log2(a/d), log2 of the mass that the mass ratio
+    multiplies (the primary's times the largest mass ratio, or the companion's where it is given), log2 of the
+    primary's flux, the weights of the second to fourth of its tracks, and the first row of its group of tracks and
+    that of its law (as bits).  A law has the scatter of log2 a, the cumulative probability of the longest axis, the
+    three numbers of the mass ratio (see `companion_mass`), the multiplicity fraction.  A track row has log2 of the
+    flux on the four tracks of a group at one mass and at the next.
     """
 
     star: NDArray[np.float32]  # (n, 8)
@@ -75,7 +76,10 @@ class Tables(NamedTuple):
     isotropic: bool
     largest_fraction: float
     weight: NDArray[np.float32]  # (n,) of each star in a stack; no rows where all count alike
-    alias: NDArray[np.float32]  # (n, 2) alias table of the multiplicity fractions: see `alias_table`
+    abundance: NDArray[
+        np.float32
+    ]  # (n,) of each row among the stars, over the largest; none where all are alike
+    alias: NDArray[np.float32]  # (n, 2) alias table of abundance x multiplicity fraction: see `alias_table`
 
 
 @lru_cache(maxsize=2)
@@ -96,14 +100,15 @@ def tables_of(population: Population) -> Tables:
     given = ~np.isnan(law.mass_ratio)
     g = law.mass_ratio_exponent + 1
     power_law = (np.abs(g) > 1e-9) & ~given
+    q_min = law.mass_ratio_min / law.mass_ratio_max
     log2_10, magnitude_to_log2 = math.log2(10.0), -0.4 * math.log2(10.0)
     laws = np.stack(
         [
             law.log_a_sigma * log2_10,
             ndtr((law.log_a_max - law.log_a) / law.log_a_sigma),
             np.divide(1.0, g, out=np.zeros_like(g), where=power_law),
-            np.where(power_law, law.mass_ratio_min ** np.where(power_law, g, 1.0), 1.0),
-            np.where(power_law | given, 0.0, np.log2(law.mass_ratio_min)),
+            np.where(power_law, q_min ** np.where(power_law, g, 1.0), 1.0),
+            np.where(power_law | given, 0.0, np.log2(q_min)),
             law.multiplicity_fraction,
             np.zeros_like(g),
             np.zeros_like(g),
@@ -117,7 +122,7 @@ def tables_of(population: Population) -> Tables:
     columns = [
         (law.log_a - np.log10(stars.distance)) * log2_10
         - math.log2(population.cut / CUT),  # au / pc = arcsec
-        np.log2(stars.mass * np.where(given, law.mass_ratio, 1.0)),
+        np.log2(stars.mass * np.where(given, law.mass_ratio, law.mass_ratio_max)),
         magnitudes(tracks, stars.mass[:, None])[:, 0] * magnitude_to_log2,
         *tracks.weight.T[1:],
     ]
@@ -125,7 +130,8 @@ def tables_of(population: Population) -> Tables:
         number.astype(np.int32).view(np.float32)
         for number in (group_number.ravel() * (light.shape[0] - 1), law_number.ravel())
     ]
-    equal = bool(np.all(population.weight == 1.0))
+    equal, abundance = bool(np.all(population.weight == 1.0)), population.abundance
+    alike = bool(np.all(abundance == 1.0))
     return Tables(
         star=np.stack([*(column.astype(np.float32) for column in columns), *numbers], axis=1),
         law=law_rows,
@@ -137,7 +143,8 @@ def tables_of(population: Population) -> Tables:
         isotropic=population.projection == "isotropic",
         largest_fraction=float(law.multiplicity_fraction.max()),
         weight=np.empty(0, np.float32) if equal else population.weight.astype(np.float32),
-        alias=alias_table(law.multiplicity_fraction),
+        abundance=np.empty(0, np.float32) if alike else (abundance / abundance.max()).astype(np.float32),
+        alias=alias_table(abundance * law.multiplicity_fraction),
     )
 
 
@@ -217,7 +224,8 @@ def single_star(tables, scale, key_low, key_high, stack_low, stack_high, draw): 
         draw += 1
         star = int64((uint64(words[0]) * uint64(tables.alias.shape[0])) >> uint64(32))
         law = bits(tables.star[star, LAW])
-        if uniform_pair(words[1], words[2]) >= scale * tables.law[law, FRACTION]:
+        is_here = tables.abundance.size == 0 or unit(words[3]) < tables.abundance[star]
+        if is_here and uniform_pair(words[1], words[2]) >= scale * tables.law[law, FRACTION]:
             single = star
     return single, draw
 
