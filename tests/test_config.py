@@ -86,7 +86,7 @@ def test_models_by_name_and_with_options():
         ),
         (
             {"multiplicity": {"gap_rule": "upper"}},
-            "multiplicity.gap_rule: must be 'lower' or 'solar', got upper",
+            "multiplicity.gap_rule: must be 'lower', 'solar', 'nearest' or 'interpolated', got upper",
         ),
     ],
 )

@@ -220,7 +220,7 @@ def _known(
     """Interval of each quantity, and what moves eta; nothing for stars of unequal weight."""
     names = [f"{name}_{end}" for name in NAMES for end in ("low", "high")]
     if config.stack_weight != "equal":
-        return dict.fromkeys([*names, "sources"])
+        return dict.fromkeys([*names, "sources", "models"])
     found = uncertainty(
         population.primaries,
         reply,
@@ -233,7 +233,8 @@ def _known(
     )
     ends = [end for name in NAMES for end in found.interval(name)]
     ranking = [{"source": source, "change": change} for source, change in found.ranking()]
-    return dict(zip(names, ends, strict=True)) | {"sources": ranking}
+    models = [{"model": name, "eta": float(values[0])} for name, values in found.models.items()]
+    return dict(zip(names, ends, strict=True)) | {"sources": ranking, "models": models}
 
 
 def _quantiles(
@@ -274,6 +275,8 @@ def predicted_lines(answer: dict[str, Any]) -> list[list[Any]]:
         lines.append([key, value, *("" if end is None else end for end in known)])
     for row in answer["size_quantiles"] or []:
         lines.append([f"dr2_rel at {row['probability']:g}", row["dr2_rel"], "", ""])
+    for row in answer["models"] or []:
+        lines.append([f"eta by {row['model']}", row["eta"], "", ""])
     for row in answer["sources"] or []:
         lines.append([f"eta moves by {row['source']}", row["change"], "", ""])
     return lines

@@ -44,7 +44,7 @@ ReaderOptions = Annotated[
 Band = Annotated[str | None, typer.Option("--band", help="Of the magnitudes; i, or the catalogue's own.")]
 Mag = Annotated[tuple[float, float], typer.Option("--mag", help="Magnitude range [lo, hi).", metavar="LO HI")]
 MultiplicityName = Annotated[
-    str, typer.Option("--multiplicity", help="dk13, dk13-kcm16, or {model: dk13, gap_rule: solar, ...}.")
+    str, typer.Option("--multiplicity", help="dk13, modern, ... or {model: dk13, gap_rule: solar, ...}.")
 ]
 PhotometryName = Annotated[
     str,
@@ -102,7 +102,7 @@ def stars(
         )  # fmt: skip
         read = catalog_of(config)
     selected = draw_stars(config, read)
-    law = config.multiplicity.build().companions(selected.mass)
+    law = config.multiplicity.build().companions(selected.mass, selected.metallicity)
     counts = selected.counts(mag, law.multiplicity_fraction[law.first])
     if output is not None:
         write_stars(selected, output)

@@ -72,11 +72,13 @@ class Multiplicity(_Strict):
     """A named multiplicity model with any of its options changed."""
 
     model: str = "dk13"
-    gap_rule: Literal["lower", "solar"] | None = None
+    gap_rule: Literal["lower", "solar", "nearest", "interpolated"] | None = None
     a_max_factor: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     scatter_scale: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     projection: Literal["isotropic", "inclination-uniform"] | None = None
     mass_ratio_min: float | None = Field(default=None, gt=0, lt=1)
+    eccentricity: Literal["circular", "uniform", "thermal", "mds17"] | None = None
+    metallicity: Literal["none", "moe19"] | None = None
 
     def build(self) -> Any:
         """The model itself.
@@ -95,9 +97,15 @@ class Multiplicity(_Strict):
 
         named = known("multiplicity", self.model, MULTIPLICITY)
         options = self.model_dump(exclude={"model"}, exclude_unset=True)
+        own = {field.name for field in dataclasses.fields(named)}
+        for name in options.keys() - own:
+            raise InputError(
+                f"is no option of {self.model}, which has {', '.join(sorted(own))}",
+                key=f"multiplicity.{name}",
+            )
         try:
             return dataclasses.replace(named, **options)
-        except (TypeError, ValueError) as error:
+        except ValueError as error:
             raise InputError(str(error), key="multiplicity") from None
 
 

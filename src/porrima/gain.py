@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from porrima.averages import population_moments
+from porrima.companions import RowErrors
 from porrima.integrals import integrate
 from porrima.photometry import PHOTOMETRY
 from porrima.systems import Population
-from porrima.uncertainty import CUT_ERROR, ROW_ERRORS
+from porrima.uncertainty import CUT_ERROR
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from porrima.multiplicity import DucheneKraus2013
+    from porrima.companions import MultiplicityModel
     from porrima.photometry import MassLuminosity
     from porrima.stars import Stars
 
@@ -28,17 +29,10 @@ if TYPE_CHECKING:
 
 __all__ = ["gain"]
 
-_FIGURES = {  # of a row of the table: what it is called in the law of companions
-    "multiplicity_fraction": "multiplicity_fraction",
-    "mass_ratio_exponent": "mass_ratio_exponent",
-    "log_a": "log_a",
-    "sigma_log_period": "log_a_sigma",
-}
-
 
 def gain(
     bins: Sequence[tuple[tuple[float, float], Stars]],
-    multiplicity: DucheneKraus2013,
+    multiplicity: MultiplicityModel,
     photometry: MassLuminosity = PHOTOMETRY["main-sequence"],
     cut: float = 0.05,
     binary_fraction: float | None = None,
@@ -49,7 +43,7 @@ def gain(
     ----------
     bins : sequence of ((float, float), Stars)
         Half-open ranges in mag with their stars, the brightest first.
-    multiplicity : DucheneKraus2013
+    multiplicity : MultiplicityModel
         The table and how it is read.
     photometry : MassLuminosity
         Mass to light.
@@ -66,8 +60,8 @@ def gain(
     Notes
     -----
     What moves one bin moves the others, so the ratio is known better than either number: each figure of the table is
-    moved in all bins at once.  Errors are added in quadrature in the logarithm, and the choices (photometry, gap rule,
-    projection) taken as an envelope, as in `uncertainty.uncertainty`; the finite number of stars is left out.  The
+    moved in all bins at once.  Errors are added in quadrature in the logarithm, and the choices (photometry and those
+    of the model) taken as an envelope, as in `uncertainty.uncertainty`; the finite number of stars is left out.  The
     truncation of the orbits is part of the model, not a choice among these.
 
     References
@@ -81,7 +75,7 @@ def gain(
     def mean_x(populations: list[Population]) -> FloatArray:
         return np.array([population_moments(p, integrate(p), fraction).mean_x[0] for p in populations])
 
-    def read(model: DucheneKraus2013, light: MassLuminosity) -> list[Population]:
+    def read(model: MultiplicityModel, light: MassLuminosity) -> list[Population]:
         return [Population.of(s, multiplicity=model, photometry=light, cut=cut) for _, s in bins]
 
     start = read(multiplicity, photometry)
@@ -104,35 +98,28 @@ def gain(
     )
 
 
-def _moved(start: list[Population], model: DucheneKraus2013) -> Iterator[tuple[list[Population], ...]]:
+def _moved(start: list[Population], model: MultiplicityModel) -> Iterator[tuple[list[Population], ...]]:
     """All bins with one figure of one row, or the cut, moved down and up by its error."""
-    width = 2.0 / 3.0 * model.scatter_scale  # of log a over that of log P
-    for number, row in enumerate(ROW_ERRORS):
-        for figure, name in _FIGURES.items():
-            unit = width if figure == "sigma_log_period" else 1.0
-            ends = zip((-unit, unit), getattr(row, figure), strict=True)
-            yield tuple([_with(p, model, number, name, sign * error) for p in start] for sign, error in ends)
+    for number, row in enumerate(model.row_errors):
+        for figure in RowErrors._fields:
+            ends = zip((-1.0, 1.0), getattr(row, figure), strict=True)
+            yield tuple(
+                [_with(p, model, number, figure, sign * error) for p in start] for sign, error in ends
+            )
     yield tuple([replace(p, cut=p.cut * (1 + sign * CUT_ERROR)) for p in start] for sign in (-1, 1))
 
 
-def _with(population: Population, model: DucheneKraus2013, row: int, name: str, change: float) -> Population:
+def _with(
+    population: Population, model: MultiplicityModel, row: int, figure: str, change: float
+) -> Population:
     """Population with one figure of the law of companions changed where its stars take a row."""
-    law = population.law
     here = np.where(model.rows(population.stars.mass) == row, change, 0.0)
-    moved: Any = {name: getattr(law, name) + here}
-    if name == "log_a":
-        moved["log_a_max"] = law.log_a_max + here
-    if name == "multiplicity_fraction":
-        moved[name] = np.clip(moved[name], 0.0, 1.0)
-    return replace(population, law=replace(law, **moved))
+    return replace(population, law=population.law.moved(figure, here))
 
 
-def _choices(
-    model: DucheneKraus2013, photometry: MassLuminosity
-) -> Iterator[tuple[DucheneKraus2013, MassLuminosity]]:
+def _choices(model: Any, photometry: MassLuminosity) -> Iterator[tuple[MultiplicityModel, MassLuminosity]]:
     """Models and relations in all combinations of what may be read either way, as given first."""
     lights = [photometry, *(light for light in PHOTOMETRY.values() if light != photometry)]
-    gaps = sorted(("lower", "solar"), key=lambda rule: rule != model.gap_rule)
-    turned = sorted(("isotropic", "inclination-uniform"), key=lambda name: name != model.projection)
-    for light, rule, projection in itertools.product(lights, gaps, turned):
-        yield replace(model, gap_rule=rule, projection=projection), light  # type: ignore[arg-type]
+    options = [[(name, getattr(model, name)), (name, other)] for name, other in model.choices.items()]
+    for light, *chosen in itertools.product(lights, *options):
+        yield replace(model, **dict(chosen)), light

@@ -24,7 +24,7 @@ from porrima.photometry import magnitude_on_track
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from porrima.multiplicity import CompanionLaw
+    from porrima.companions import CompanionLaw
     from porrima.orbits import Projection
     from porrima.systems import Population
 

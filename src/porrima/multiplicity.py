@@ -1,14 +1,21 @@
-"""How many stars have a companion, how massive it is, how wide its orbit: one object per published model."""
+"""How many stars have a companion, how massive it is, how wide its orbit: models by name.
+
+`DucheneKraus2013`, what KCM16 use, is here; those of other papers are in `published` and `moe`.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from porrima.companions import CompanionLaw, MultiplicityModel, RowErrors, multiplicity_scale
+from porrima.eccentricity import Eccentricity, check_eccentricity, eccentric
+from porrima.moe import MoeDiStefano2017
 from porrima.photometry import check_masses
+from porrima.published import Offner2023, Raghavan2010, SusemiehlMeyer2022, Winters2019
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,100 +23,10 @@ if TYPE_CHECKING:
     from porrima.orbits import Projection
 
     FloatArray = NDArray[np.float64]
-    IntArray = NDArray[np.int64]
 
-__all__ = ["MULTIPLICITY", "CompanionLaw", "DucheneKraus2013", "MultiplicityModel", "multiplicity_scale"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CompanionLaw:
-    r"""Statistics of the companions of n stars: m classes of them, at least one for each star.
-
-    A class is a power law of the mass ratio with a log-normal of the semi-major axis.  A star that has a companion
-    has one of a class of its own with the probability `share`, so that classes make a mixture.
-
-    Parameters
-    ----------
-    star : (m,) int array
-        Number of the star of each class, from 0 to n - 1, ascending.
-    share : (m,) float array
-        Of the class among the companions of its star, in [0, 1]; the shares of a star sum to 1.
-    multiplicity_fraction : (m,) float array
-        Probability that the star has a companion, in [0, 1]; the same in all its classes.
-    mass_ratio_exponent : (m,) float array
-        :math:`\gamma` of :math:`dN/dq \propto q^\gamma`, dimensionless.
-    mass_ratio_min, mass_ratio_max : (m,) float array
-        Range of the mass ratio, in (0, 1].
-    log_a : (m,) float array
-        Mean of log10 of the semi-major axis in au, before any truncation.
-    log_a_sigma : (m,) float array
-        Its standard deviation, in dex.
-    log_a_max : (m,) float array
-        log10 of the largest semi-major axis in au; infinite where there is none.
-    mass_ratio : (m,) float array
-        The mass ratio itself where a catalogue gives it, in (0, 1]; NaN where it is drawn.
-    """
-
-    star: IntArray
-    share: FloatArray
-    multiplicity_fraction: FloatArray
-    mass_ratio_exponent: FloatArray
-    mass_ratio_min: FloatArray
-    mass_ratio_max: FloatArray
-    log_a: FloatArray
-    log_a_sigma: FloatArray
-    log_a_max: FloatArray
-    mass_ratio: FloatArray
-
-    @property
-    def first(self) -> IntArray:
-        """First class of each star, (n,)."""
-        starts: IntArray = np.flatnonzero(np.diff(self.star, prepend=-1))
-        return starts
-
-    @property
-    def abundance(self) -> FloatArray:
-        """Share of each class among the stars over the mean one, (m,): its weight in averages over stars."""
-        return self.share * (self.star.size / self.first.size)
-
-    def with_given(self, mass_ratio: FloatArray) -> CompanionLaw:
-        """The law with the pairs that a catalogue has made: their mass ratios fixed, its single stars single.
-
-        Classes keep their shares, whatever the mass ratio.
-
-        Parameters
-        ----------
-        mass_ratio : (n,) float array
-            In [0, 1], 0 for a single star, NaN where the law decides.
-
-        Returns
-        -------
-        law : CompanionLaw
-            Orbits as before, in log10 au.
-        """
-        mass_ratio = mass_ratio[self.star]
-        return replace(
-            self,
-            multiplicity_fraction=np.where(
-                np.isnan(mass_ratio), self.multiplicity_fraction, (mass_ratio > 0).astype(float)
-            ),
-            mass_ratio=np.where(mass_ratio > 0, mass_ratio, np.nan),
-        )
-
-
-class MultiplicityModel(Protocol):
-    """A published account of stellar multiplicity."""
-
-    @property
-    def mass_range(self) -> tuple[float, float]:
-        """Least and largest mass of a primary, in M_sun."""
-
-    @property
-    def projection(self) -> Projection:
-        """How orbits are turned to the line of sight."""
-
-    def companions(self, mass: FloatArray) -> CompanionLaw:
-        """Companion statistics of primaries, mass in M_sun, (n,) float array."""
+__all__ = [
+    "COMPILATIONS", "MULTIPLICITY", "CompanionLaw", "DucheneKraus2013", "MultiplicityModel", "multiplicity_scale",
+]  # fmt: skip
 
 
 class _Row(NamedTuple):
@@ -126,6 +43,16 @@ class _Row(NamedTuple):
 _VERY_LOW = _Row(0.0, 0.1, 0.22, 4.2, 4.5, 0.5)
 _LOW = _Row(0.1, 0.5, 0.26, 0.4, 5.3, 1.3)
 _SOLAR = _Row(0.7, 1.3, 0.44, 0.3, 45.0, 2.3)
+
+
+ROW_ERRORS = (
+    RowErrors((0.04, 0.06), (1.0, 1.0), (0.05, 0.05), (0.25, 0.25)),
+    RowErrors((0.03, 0.03), (0.2, 0.2), (0.30, 0.30), (0.25, 0.25)),
+    RowErrors((0.02, 0.02), (0.1, 0.1), (0.05, 0.05), (0.10, 0.10)),
+)
+"""Below 0.1, 0.1-0.5 and about 1 M_sun.  Multiplicity fractions and exponents as published (Duchene & Kraus 2013);
+they give no error of mean separations and widths: half the distance to the later compilations is taken (Winters et
+al. 2019: 20 au; Susemiehl & Meyer 2022: 27 and 50 au; Offner et al. 2023: 4, 25 and 40 au and their widths)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,6 +73,8 @@ class DucheneKraus2013:
         and by up to 12 % where orbits are truncated.
     mass_ratio_min : float
         Least mass ratio, in (0, 1).
+    eccentricity : {"circular", "uniform", "thermal", "mds17"}
+        Of the orbits; KCM16 take circles.
 
     Raises
     ------
@@ -171,6 +100,7 @@ class DucheneKraus2013:
     scatter_scale: float = 1.0
     projection: Projection = "isotropic"
     mass_ratio_min: float = 0.1
+    eccentricity: Eccentricity = "circular"
 
     def __post_init__(self) -> None:
         if self.gap_rule not in ("lower", "solar"):
@@ -183,11 +113,30 @@ class DucheneKraus2013:
             raise ValueError(f"scatter_scale must be positive and finite, got {self.scatter_scale}")
         if not 0 < self.mass_ratio_min < 1:
             raise ValueError(f"mass_ratio_min must be in (0, 1), got {self.mass_ratio_min}")
+        check_eccentricity(self.eccentricity)
 
     @property
     def mass_range(self) -> tuple[float, float]:
         """Least and largest mass of a primary, in M_sun; KCM16 give no widths above 1.5."""
         return (0.0, 1.5)
+
+    @property
+    def row_errors(self) -> tuple[RowErrors, ...]:
+        """Errors of each row: `ROW_ERRORS`, those of the scatter on its scale."""
+        scale = self.scatter_scale
+        return tuple(
+            row._replace(sigma_log_period=(scale * row.sigma_log_period[0], scale * row.sigma_log_period[1]))
+            for row in ROW_ERRORS
+        )
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """The gap rule and the projection, each the other way."""
+        projections = {"isotropic": "inclination-uniform", "inclination-uniform": "isotropic"}
+        return {
+            "gap_rule": {"lower": "solar", "solar": "lower"}[self.gap_rule],
+            "projection": projections[self.projection],
+        }
 
     def rows(self, mass: FloatArray) -> NDArray[np.int64]:
         """Row of the table that each primary takes, the masses between rows by the gap rule.
@@ -205,18 +154,20 @@ class DucheneKraus2013:
         solar_from = _SOLAR.mass_lo if self.gap_rule == "lower" else _LOW.mass_hi
         return np.where(mass < _VERY_LOW.mass_hi, 0, np.where(mass < solar_from, 1, 2))
 
-    def companions(self, mass: FloatArray) -> CompanionLaw:
+    def companions(self, mass: FloatArray, metallicity: FloatArray | None = None) -> CompanionLaw:
         r"""Companion statistics of each primary.
 
         Parameters
         ----------
         mass : (n,) float array
             Mass of the primary, in M_sun.
+        metallicity : (n,) float array, optional
+            [M/H], in dex; without effect.
 
         Returns
         -------
         law : CompanionLaw
-            Arrays of n stars: axes in log10 au, scatter in dex.
+            One class for each star, or one for each node of the eccentricity: axes in log10 au, scatter in dex.
 
         Raises
         ------
@@ -227,7 +178,7 @@ class DucheneKraus2013:
         table = np.array([_VERY_LOW, _LOW, _SOLAR])[self.rows(mass)]
         log_a = np.log10(table[:, 4])
         beyond = math.inf if self.a_max_factor is None else math.log10(self.a_max_factor)
-        return CompanionLaw(
+        law = CompanionLaw(
             star=np.arange(mass.size),
             share=np.ones(mass.shape),
             multiplicity_fraction=table[:, 2],
@@ -239,65 +190,21 @@ class DucheneKraus2013:
             log_a_max=log_a + beyond,
             mass_ratio=np.full(mass.shape, np.nan),
         )
+        return eccentric(law, mass, self.eccentricity)
 
 
-MULTIPLICITY: dict[str, DucheneKraus2013] = {
+MULTIPLICITY: dict[str, MultiplicityModel] = {
     "dk13": DucheneKraus2013(),
     "dk13-kcm16": DucheneKraus2013(gap_rule="solar", a_max_factor=2.5),
+    "offner23": Offner2023(),
+    "raghavan10": Raghavan2010(),
+    "winters19": Winters2019(),
+    "sm22": SusemiehlMeyer2022(),
+    "mds17": MoeDiStefano2017(),
+    "modern": Offner2023(gap_rule="interpolated", eccentricity="mds17", metallicity="moe19"),
 }
-"""Models by name; ``dk13-kcm16`` is the variant that reproduces the magnitude dependence of KCM16."""
+"""Models by name; ``dk13-kcm16`` is the variant that reproduces the magnitude dependence of KCM16, ``modern`` what is
+known today: the figures of Offner et al. (2023) without steps, eccentric orbits, close pairs by metallicity."""
 
-
-def multiplicity_scale(
-    multiplicity_fraction: FloatArray, binary_fraction: FloatArray, abundance: FloatArray | None = None
-) -> FloatArray:
-    r"""Factor s that scales every star's multiplicity fraction so that a population has a binary fraction F.
-
-    Parameters
-    ----------
-    multiplicity_fraction : (n,) float array
-        Of each star as the model gives it, in [0, 1].
-    binary_fraction : (k,) float array
-        Wanted mean over the stars, in [0, 1].
-    abundance : (n,) float array, optional
-        Weight of each star in that mean, of mean 1 (dimensionless); all alike where not given.
-
-    Returns
-    -------
-    scale : (k,) float array
-        Dimensionless.
-
-    Raises
-    ------
-    ValueError
-        If a binary fraction lies outside [0, 1] or beyond what stars with any companions can give.
-
-    Notes
-    -----
-    Solves :math:`\frac{1}{n} \sum_i \min(1, s\, MF_i) = F` exactly: the left side is linear in s between
-    the values :math:`1/MF_i`.  The capping at 1 changes the population at large F (KCM16 Sect. 5.1).
-
-    References
-    ----------
-    KCM16
-    """
-    wanted = np.asarray(binary_fraction, dtype=float)
-    if np.any((wanted < 0) | (wanted > 1) | ~np.isfinite(wanted)):
-        raise ValueError(
-            f"binary_fraction must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}"
-        )
-    order = np.argsort(multiplicity_fraction, kind="stable")
-    ascending = multiplicity_fraction[order]
-    number = np.ones_like(ascending) if abundance is None else abundance[order]
-    values, first = np.unique(ascending, return_index=True)
-    values, first = values[values > 0], first[values > 0]
-    sum_below = np.concatenate([[0.0], np.cumsum(number * ascending)])[first]
-    number_below = np.concatenate([[0.0], np.cumsum(number)])
-    above = number_below[-1] - number_below[first]
-    reached = np.concatenate([[0.0], ((sum_below / values + above) / number_below[-1])[::-1]])
-    if np.any(wanted > reached[-1] * (1 + 1e-12)):
-        raise ValueError(
-            f"binary_fraction must be at most {reached[-1]:.6g} for these stars, got {wanted.max()}"
-        )
-    scale: FloatArray = np.interp(wanted, reached, np.concatenate([[0.0], 1.0 / values[::-1]]))
-    return scale
+COMPILATIONS = ("dk13", "offner23", "sm22", "modern")
+"""Those that hold for the masses of nearly all stars: what they differ by is the spread between models."""

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from porrima.companions import multiplicity_scale
 from porrima.errors import InputError
 from porrima.moments import KernelMoments, moments_of_points
-from porrima.multiplicity import multiplicity_scale
 from porrima.units import to_internal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from porrima.multiplicity import CompanionLaw, MultiplicityModel
+    from porrima.companions import CompanionLaw, MultiplicityModel
     from porrima.orbits import Projection
     from porrima.photometry import MassLuminosity, Tracks
     from porrima.stars import Stars
@@ -100,7 +100,7 @@ class Population:
         if not 0 < cut < np.inf:
             raise InputError("must be positive and finite [arcsec]", key="cut", value=cut)
         try:
-            law = multiplicity.companions(stars.mass)
+            law = multiplicity.companions(stars.mass, stars.metallicity)
             if stars.mass_ratio is not None:
                 law = law.with_given(stars.mass_ratio)
             tracks = photometry.tracks(stars.mass, stars.metallicity, stars.log_age, stars.band)
