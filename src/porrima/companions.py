@@ -144,8 +144,12 @@ class CompanionLaw:
         mean = self._mean(self.log_a)
         sigma = np.sqrt(self._mean(self.log_a_sigma**2 + (self.log_a - mean) ** 2))
         stretch = 1.0 + 2.0 / 3.0 * change / sigma
+        width = self.log_a_sigma * stretch
+        alone = np.bincount(self.star)[self.star] == 1
         return replace(
-            self, log_a=mean + (self.log_a - mean) * stretch, log_a_sigma=self.log_a_sigma * stretch
+            self,
+            log_a=mean + (self.log_a - mean) * stretch,
+            log_a_sigma=np.where(alone | (change == 0), width, np.round(width, 2)),  # few widths, few tables
         )
 
     def _mean(self, values: FloatArray) -> FloatArray:

@@ -31,8 +31,9 @@ Eccentricity = Literal["circular", "uniform", "thermal", "mds17"]
 NODES = 4
 """Classes that a class becomes: Gauss's rule, exact for polynomials of degree 7 in log10 of the distance (count)."""
 
-_FINE = 256  # points in the eccentricity, and in the eccentric anomaly, of the distribution behind the nodes
+_FINE = 64  # points in the eccentricity, and in the eccentric anomaly, of the distribution behind the nodes
 _PERIOD_STEP = 0.25  # dex, to which periods are rounded so that classes share their nodes
+_WIDTH_STEP = 0.02  # dex, likewise for the widths of narrow classes, so that they share tables of separations
 _LOG_YEAR = float(np.log10(365.25))
 
 
@@ -168,7 +169,7 @@ def orbit_nodes(
     Notes
     -----
     The mean anomaly is uniform, so the eccentric one has the density :math:`(1 - e\cos E)/2\pi`.  Gauss's rule for
-    the distribution of :math:`\log_{10}(1 - e\cos E)`, from its recursion of orthogonal polynomials on 256 x 256
+    the distribution of :math:`\log_{10}(1 - e\cos E)`, from its recursion of orthogonal polynomials on 64 x 64
     points.
 
     References
@@ -243,7 +244,8 @@ def eccentric(law: CompanionLaw, mass: FloatArray, eccentricity: Eccentricity) -
     of = np.repeat(np.arange(law.star.size), copies)
     node = np.arange(of.size) - np.repeat(np.cumsum(copies) - copies, copies)
     moved = np.where(alone[of], shift[of, node], mean[of])
-    sigma = np.where(alone, law.log_a_sigma, np.round(np.sqrt(law.log_a_sigma**2 + variance), 6))
+    wider = _WIDTH_STEP * np.round(np.sqrt(law.log_a_sigma**2 + variance) / _WIDTH_STEP)
+    sigma = np.where(alone, law.log_a_sigma, wider)
     out = law.take(of)
     return replace(
         out,

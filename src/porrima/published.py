@@ -146,7 +146,7 @@ class _LogNormals:
             return tuple(rows[self.rows(mass)].T)
         centre = np.log10([row.mass_lo * row.mass_hi for row in self.table]) / 2.0
         between = [np.interp(np.log10(mass), centre, column) for column in rows.T]
-        steps = (0.001, 0.01, 0.001, 0.05)  # so that stars share what is computed once for all of a kind
+        steps = (0.001, 0.01, 0.001, 0.1)  # so that stars share what is computed once for all of a kind
         return tuple(step * np.round(column / step) for step, column in zip(steps, between, strict=True))
 
     def _unprojected(self, log_s: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
