@@ -28,8 +28,8 @@ __all__ = [
 Eccentricity = Literal["circular", "uniform", "thermal", "mds17"]
 """Density of the eccentricity: all 0; 1; 2e; or a power of e that depends on the period."""
 
-NODES = 4
-"""Classes that a class becomes: Gauss's rule, exact for polynomials of degree 7 in log10 of the distance (count)."""
+NODES = 5
+"""Classes that a class becomes: Gauss's rule, exact for polynomials of degree 9 in log10 of the distance (count)."""
 
 _FINE = 64  # points in the eccentricity, and in the eccentric anomaly, of the distribution behind the nodes
 _PERIOD_STEP = 0.25  # dex, to which periods are rounded so that classes share their nodes
