@@ -76,7 +76,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "sample": {"catalogs", "config", "errors", "galaxy", "stars", "systems"},
     "tallies": set(),
     "lock": {"errors"},
-    "store": {"config", "errors", "lock", "moments", "sample", "stars", "systems", "tallies"},
+    "store": {"config", "errors", "lock", "moments", "multiplicity", "sample", "stars", "systems", "tallies"},
     "cluster": {"errors"},
     "simulation": {
         "cluster", "config", "errors", "images", "moments", "psf", "response", "sample", "shapes", "stack", "store",
@@ -95,7 +95,12 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
         "config", "galaxy", "multiplicity", "prediction", "psf", "response", "sample", "shapes", "simulation", "stars",
         "store", "summary", "uncertainty",
     },
+    "comparison": {
+        "averages", "companions", "config", "integrals", "io", "multiplicity", "multiplicity_figure", "sample",
+        "systems",
+    },
     "figures": {"instruments"},
+    "multiplicity_figure": {"figures"},
     "star_figures": {"figures", "stars"},
     "scatter_figure": {"figures"},
     "diagrams": {"figures", "instruments"},

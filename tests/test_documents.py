@@ -7,6 +7,7 @@ import shlex
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 import yaml
@@ -14,6 +15,7 @@ import yaml
 import porrima
 from porrima.catalogs import READERS
 from porrima.cli import app, main
+from porrima.comparison import ORBITS, mean_x_by_model
 from porrima.config import (
     GalaxiesConfig,
     Multiplicity,
@@ -191,6 +193,16 @@ def test_the_headline_table_is_what_predict_gives(monkeypatch, capsys, model):
     line = f"predict --l 180 --b 45 --mag 18 19 --psf psf0 --binary-fraction 0.35 --multiplicity {model}"
     result = json_of(monkeypatch, capsys, *line.split())
     assert 1e4 * result["eta"] == pytest.approx(shown["18–19"], rel=0.02)
+
+
+def test_the_table_of_models_is_what_they_give():
+    text = MODELS.read_text(encoding="utf-8")
+    found = mean_x_by_model(np.array([18.0, 19.0]))["mean_x"]
+    for model in MULTIPLICITY:
+        for orbits in ORBITS:
+            row = re.search(rf"^\| `{model}`, {orbits} \|(.*)\|$", text, re.M)[1].split("|")
+            value = 1e6 * float(found.sel(model=model, orbits=orbits, bin=0))
+            assert float(row[2]) == pytest.approx(value, rel=0.01)
 
 
 @pytest.mark.parametrize("model", ["dk13", "dk13-kcm16"])

@@ -7,7 +7,7 @@ from porrima import multiplicity, uncertainty
 from porrima.averages import population_moments
 from porrima.companions import RowErrors
 from porrima.integrals import integrate
-from porrima.multiplicity import ROW_ERRORS, DucheneKraus2013
+from porrima.multiplicity import COMPILATIONS, MULTIPLICITY, ROW_ERRORS, DucheneKraus2013
 from porrima.photometry import PHOTOMETRY
 from porrima.prediction import predict
 from porrima.psf import psf_from_name
@@ -99,6 +99,39 @@ def test_the_interval_is_the_envelope_of_the_choices_and_the_quadratic_sum_of_th
         "multiplicity_fraction", "mass_ratio_exponent", "mean_separation", "sigma_log_period",
         "cut", "photometry", "gap_rule", "projection", "stars", "model",
     }  # fmt: skip
+
+
+def test_the_spread_between_models_is_that_of_their_own_predictions_and_no_part_of_the_interval(stars, reply):
+    found = uncertainty.uncertainty(stars, reply, multiplicity=MULTIPLICITY["dk13"], photometry=LIGHT)
+    assert set(found.models) == set(COMPILATIONS) - {"dk13"}
+    own = {name: eta(stars, reply, MULTIPLICITY[name]) for name in found.models}
+    for name, values in found.models.items():
+        assert values[0] == pytest.approx(own[name], rel=5e-3)
+    one = source(found, "model")
+    assert one.kind == "model"
+    assert one.high[0] == pytest.approx(max(own.values()) - eta_given(found), rel=2e-2)
+    assert found.high[0] < eta_given(found) + one.high[0]
+
+
+@pytest.mark.parametrize("name", ["offner23", "sm22", "modern"])
+def test_every_model_has_errors_of_its_own(stars, reply, name):
+    """The fraction of each row moved down and up, in quadrature, against predictions of laws changed by hand."""
+    model = MULTIPLICITY[name]
+    found = uncertainty.uncertainty(stars, reply, multiplicity=model, photometry=LIGHT)
+    population = Population.of(stars, multiplicity=model, photometry=LIGHT)
+    integrals, row = integrate(population), model.rows(population.stars.mass)
+    squares = 0.0
+    for number, errors in enumerate(model.row_errors):
+        more = np.where(row == number, errors.multiplicity_fraction[1], 0.0)
+        law = population.law
+        changed = dataclasses.replace(law, multiplicity_fraction=law.multiplicity_fraction + more)
+        moments = population_moments(dataclasses.replace(population, law=changed), integrals)
+        squares += (predict(moments, reply, None).eta[0] - eta_given(found)) ** 2
+    assert source(found, "multiplicity_fraction").high[0] == pytest.approx(np.sqrt(squares), rel=0.01)
+    assert all(
+        source(found, name).high[0] > 0
+        for name in ("mass_ratio_exponent", "sigma_log_period", "eccentricity")
+    )
 
 
 def test_fewer_stars_give_nearly_the_same_changes(stars, reply, monkeypatch):

@@ -105,7 +105,7 @@ class Multiplicity(_Strict):
             )
         try:
             return dataclasses.replace(named, **options)
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise InputError(str(error), key="multiplicity") from None
 
 

@@ -25,7 +25,13 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 __all__ = [
-    "COMPILATIONS", "MULTIPLICITY", "CompanionLaw", "DucheneKraus2013", "MultiplicityModel", "multiplicity_scale",
+    "COMPILATIONS",
+    "MULTIPLICITY",
+    "PAPERS",
+    "CompanionLaw",
+    "DucheneKraus2013",
+    "MultiplicityModel",
+    "multiplicity_scale",
 ]  # fmt: skip
 
 
@@ -205,6 +211,18 @@ MULTIPLICITY: dict[str, MultiplicityModel] = {
 }
 """Models by name; ``dk13-kcm16`` is the variant that reproduces the magnitude dependence of KCM16, ``modern`` what is
 known today: the figures of Offner et al. (2023) without steps, eccentric orbits, close pairs by metallicity."""
+
+PAPERS = {
+    "dk13": "Duchene & Kraus 2013",
+    "dk13-kcm16": "Duchene & Kraus 2013",
+    "offner23": "Offner et al. 2023",
+    "raghavan10": "Raghavan et al. 2010",
+    "winters19": "Winters et al. 2019",
+    "sm22": "Susemiehl & Meyer 2022",
+    "mds17": "Moe & Di Stefano 2017",
+    "modern": "Offner et al. 2023, Moe & Di Stefano 2017, Moe et al. 2019",
+}
+"""What a model asks to be cited, by its name."""
 
 COMPILATIONS = ("dk13", "offner23", "sm22", "modern")
 """Those that hold for the masses of nearly all stars: what they differ by is the spread between models."""

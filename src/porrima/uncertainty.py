@@ -47,7 +47,7 @@ MOST_STARS = 1000
 """Stars on which changes are found, evenly through those given in mass and distance (count)."""
 
 FEW_STARS = 300
-"""Stars on which other models are tried, likewise (count)."""
+"""Stars on which other models are tried, and changes of a model with several classes to a star (count)."""
 
 _INTERVALS = 32  # of the rule over the mass ratio for changes: its error, 5e-4, is the same before and after
 
@@ -191,8 +191,8 @@ def uncertainty(
     the cut and of the sample of stars are added in quadrature, as independent.  The choices (photometry:
     `MainSequence` or `HabetsHeintze1981`; those of the model, such as gap rule and projection) are no errors: the
     interval reaches from the lowest to the highest of their combinations, and by the sum in quadrature beyond.
-    Changes are found on up to `MOST_STARS` stars, to a few per cent of themselves, with the scatter of a long stack;
-    the prediction itself on all stars.
+    Changes are found on up to `MOST_STARS` stars, or `FEW_STARS` where stars have several classes of companions, to a
+    few per cent of themselves, with the scatter of a long stack; the prediction itself on all stars.
 
     The interval is that of the given model.  How far others are from it, those of `multiplicity.COMPILATIONS`, is the
     source ``model``, on up to `FEW_STARS` stars: a systematic error that no table knows of itself, and that is not
@@ -205,7 +205,10 @@ def uncertainty(
     if not 0 <= cut_error < 1:
         raise ValueError(f"cut_error must be in [0, 1), got {cut_error}")
     models = {"multiplicity": multiplicity, "photometry": photometry, "cut": cut}
-    whole = Population.of(stars, **models)  # type: ignore[arg-type]
+    with warnings.catch_warnings():
+        if integrals is not None:  # whoever made them has heard it
+            warnings.simplefilter("ignore", MassRangeWarning)
+        whole = Population.of(stars, **models)  # type: ignore[arg-type]
     integrals = integrate(whole) if integrals is None else integrals
     fraction = None if binary_fraction is None else np.array([binary_fraction])
     prediction = predict(population_moments(whole, integrals, fraction), response, n_stars)
@@ -237,6 +240,9 @@ def _changes(
     """Sources of errors and choices, and the changes by all combinations of the choices, (n, n_name)."""
     some = _thinned(stars, MOST_STARS)
     base = Population.of(some, **models)
+    if len(base.stars) > MOST_STARS:
+        some = _thinned(stars, FEW_STARS)
+        base = Population.of(some, **models)
     start = _rough(base)
     reference = judge.raw(base, start)
     change = {
