@@ -123,13 +123,13 @@ def population_moments(
     :math:`\langle w^2 (k - m)(k' - m')\rangle / (N \langle w\rangle^2)`, and the effective number is
     :math:`N \langle w\rangle^2/\langle w^2\rangle`.  Exact for equal weights.
     """
-    fraction, w = population.law.multiplicity_fraction, population.weight
+    fraction, number, w = population.law.multiplicity_fraction, population.abundance, population.weight
     scale = population.scale(binary_fraction)
     equal = bool(np.all(w == 1.0))
-    rows = [_star_sums(fraction, integrals, w, 0)]
-    rows.append(rows[0] if equal else _star_sums(fraction, integrals, w**2, 0))
-    rows.append(_star_sums(fraction, integrals, w, 1))
-    rows.append(_star_sums(fraction, integrals, np.ones_like(w), None))
+    rows = [_star_sums(fraction, integrals, number * w, 0)]
+    rows.append(rows[0] if equal else _star_sums(fraction, integrals, number * w**2, 0))
+    rows.append(_star_sums(fraction, integrals, number * w, 1))
+    rows.append(_star_sums(fraction, integrals, number, None))
     sums = _weighted_sums(np.unique(fraction), np.concatenate(rows, axis=1), scale)
     first, second, coarse, counts = np.split(sums, np.cumsum([r.shape[1] for r in rows[:-1]]), axis=1)
     pairs, resolved_pairs = counts[:, 0], counts[:, 1]
@@ -138,7 +138,8 @@ def population_moments(
         raise InputError(
             "must leave some pairs unresolved at this binary fraction", key="cut", value=population.cut
         )
-    mean_w, mean_w2 = (w.sum() - first[:, -1]) / kept, ((w**2).sum() - second[:, -1]) / kept
+    mean_w = ((number * w).sum() - first[:, -1]) / kept
+    mean_w2 = ((number * w**2).sum() - second[:, -1]) / kept
     powers = _square(first, kept * mean_w)
     squares = _square(second, kept * mean_w**2)
     mean, weighted = _isotropic_means(powers, population.cut), _isotropic_means(squares, population.cut)

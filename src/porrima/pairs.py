@@ -60,11 +60,12 @@ MOST_TRIES = 10_000
 class Tables(NamedTuple):
     """A population as the compiled loops read it: everything that one pair needs stands in two rows.
 
-    A star has the mean of log2(a/d), the scatter of log2 a and the cumulative probability of the longest axis; log2
-    of the mass that the mass ratio multiplies (the primary's, or the companion's where it is given), and the three
-    numbers of the mass ratio (see `companion_mass`); the first row of its group of tracks (as bits), a fourth of log2
-    of 1 over the primary's flux, the multiplicity fraction; the weights of its four tracks.  A track row has log2 of
-    the flux on the four tracks of a group at one mass and at the next.
+    A star has a row for each class of its companions: the mean of log2(a/d), the scatter of log2 a and the cumulative
+    probability of the longest axis; log2 of the mass that the mass ratio multiplies (the primary's times the largest
+    mass ratio, or the companion's where it is given), and the three numbers of the mass ratio (see `companion_mass`);
+    the first row of its group of tracks (as bits), a fourth of log2 of 1 over the primary's flux, the multiplicity
+    fraction; the weights of its four tracks.  A track row has log2 of the flux on the four tracks of a group at one
+    mass and at the next.
     """
 
     star: NDArray[np.float32]  # (n, 16)
@@ -76,7 +77,10 @@ class Tables(NamedTuple):
     isotropic: bool
     largest_fraction: float
     weight: NDArray[np.float32]  # (n,) of each star in a stack; no rows where all count alike
-    alias: NDArray[np.float32]  # (n, 2) alias table of the multiplicity fractions: see `alias_table`
+    abundance: NDArray[
+        np.float32
+    ]  # (n,) of each row among the stars, over the largest; none where all are alike
+    alias: NDArray[np.float32]  # (n, 2) alias table of abundance x multiplicity fraction: see `alias_table`
 
 
 @lru_cache(maxsize=2)
@@ -98,7 +102,8 @@ def tables_of(population: Population) -> Tables:
     groups, group_number = np.unique(tracks.index, axis=0, return_inverse=True)
     light = tracks.magnitude * _MAGNITUDE_TO_LOG2
     group_rows = [np.concatenate([light[:-1, group], light[1:, group]], axis=1) for group in groups]
-    equal = bool(np.all(population.weight == 1.0))
+    equal, abundance = bool(np.all(population.weight == 1.0)), population.abundance
+    alike = bool(np.all(abundance == 1.0))
     return Tables(
         star=_star_rows(population, group_number.ravel() * (light.shape[0] - 1)),
         track=np.ascontiguousarray(np.concatenate(group_rows), dtype=np.float32),
@@ -109,7 +114,8 @@ def tables_of(population: Population) -> Tables:
         isotropic=population.projection == "isotropic",
         largest_fraction=float(law.multiplicity_fraction.max()),
         weight=np.empty(0, np.float32) if equal else population.weight.astype(np.float32),
-        alias=alias_table(law.multiplicity_fraction),
+        abundance=np.empty(0, np.float32) if alike else (abundance / abundance.max()).astype(np.float32),
+        alias=alias_table(abundance * law.multiplicity_fraction),
     )
 
 
@@ -120,17 +126,17 @@ def _star_rows(population: Population, base: NDArray[np.int64]) -> NDArray[np.fl
     g = law.mass_ratio_exponent + 1
     power_law = (np.abs(g) > 1e-9) & ~given
     log2_10 = math.log2(10.0)
-    n = base.size
+    n, q_min = base.size, law.mass_ratio_min / law.mass_ratio_max
     room = np.zeros((n + 1) * WIDTH, np.float32)
     start = -room.ctypes.data % (4 * WIDTH) // 4
     rows = room[start : start + n * WIDTH].reshape(n, WIDTH)
     rows[:, A] = (law.log_a - np.log10(stars.distance)) * log2_10 - math.log2(population.cut / CUT)
     rows[:, SIGMA] = law.log_a_sigma * log2_10
     rows[:, TRUNCATION] = ndtr((law.log_a_max - law.log_a) / law.log_a_sigma)
-    rows[:, MASS] = np.log2(stars.mass * np.where(given, law.mass_ratio, 1.0))
+    rows[:, MASS] = np.log2(stars.mass * np.where(given, law.mass_ratio, law.mass_ratio_max))
     rows[:, Q_SLOPE] = np.divide(1.0, g, out=np.zeros_like(g), where=power_law)
-    rows[:, Q_START] = np.where(power_law, law.mass_ratio_min ** np.where(power_law, g, 1.0), 1.0)
-    rows[:, Q_FLAT] = np.where(power_law | given, 0.0, np.log2(law.mass_ratio_min))
+    rows[:, Q_START] = np.where(power_law, q_min ** np.where(power_law, g, 1.0), 1.0)
+    rows[:, Q_FLAT] = np.where(power_law | given, 0.0, np.log2(q_min))
     rows[:, BASE] = base.astype(np.int32).view(np.float32)
     rows[:, DIMMING] = -0.25 * _MAGNITUDE_TO_LOG2 * magnitudes(tracks, stars.mass[:, None])[:, 0]
     rows[:, FRACTION] = law.multiplicity_fraction
@@ -213,7 +219,8 @@ def single_star(tables, scale, key_low, key_high, stack_low, stack_high, draw): 
         words = philox(key_low, key_high, draw, SINGLE_STAGE, stack_low, stack_high)
         draw += 1
         star = int64((uint64(words[0]) * uint64(tables.alias.shape[0])) >> uint64(32))
-        if uniform_pair(words[1], words[2]) >= scale * tables.star[star, FRACTION]:
+        is_here = tables.abundance.size == 0 or unit(words[3]) < tables.abundance[star]
+        if is_here and uniform_pair(words[1], words[2]) >= scale * tables.star[star, FRACTION]:
             single = star
     return single, draw
 
