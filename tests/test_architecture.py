@@ -54,7 +54,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "blocks": {"elementary", "moments", "pairs"},
     "gpu": {"elementary", "errors", "moments", "pairs", "streams"},
     "stack": {"blocks", "gpu", "moments", "pairs", "streams", "systems"},
-    "integrals": {"moments", "orbits", "photometry", "systems"},
+    "integrals": {"moments", "multiplicity", "orbits", "photometry", "systems"},
     "averages": {"errors", "integrals", "moments", "systems"},
     "singles": {"moments", "response"},
     "prediction": {"averages", "integrals", "moments", "response", "singles"},

@@ -192,7 +192,7 @@ def predicted(
         "population_binary_fraction": moments.binary_fraction[0],
         "unresolved_fraction": moments.unresolved_fraction[0],
         "removed_fraction": moments.removed_fraction[0],
-        "n_catalog_stars": len(population.stars),
+        "n_catalog_stars": len(population.primaries),
         **_spread(prediction),
         "quadrature_error": moments.relative_error[0],
         **known,
@@ -222,7 +222,7 @@ def _known(
     if config.stack_weight != "equal":
         return dict.fromkeys([*names, "sources"])
     found = uncertainty(
-        population.stars,
+        population.primaries,
         reply,
         multiplicity=config.multiplicity.build(),
         photometry=config.photometry.build(),

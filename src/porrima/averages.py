@@ -67,7 +67,7 @@ class PopulationMoments:
         stack; j = 0 counts pairs.  Dimensionless.
     relative_error : (k,) float array
         Of the quadrature: the largest estimate among all powers with j and k above 0 and the mean
-        moments, dimensionless.
+        moments, with a selection among x and x² alone; dimensionless.
 
     Notes
     -----
@@ -136,23 +136,24 @@ def population_moments(
     :math:`\langle w^2 (k - m)(k' - m')\rangle / (N \langle w\rangle^2)`, and the effective number is
     :math:`N \langle w\rangle^2/\langle w^2\rangle`.  Exact for equal weights.
     """
-    fraction, w = population.law.multiplicity_fraction, population.weight
+    fraction, number, w = population.law.multiplicity_fraction, population.abundance, population.weight
     scale = population.scale(binary_fraction)
     equal = bool(np.all(w == 1.0))
-    rows = [_star_sums(fraction, integrals, w, 0)]
-    rows.append(rows[0] if equal else _star_sums(fraction, integrals, w**2, 0))
-    rows.append(_star_sums(fraction, integrals, w, 1))
-    rows.append(_star_counts(fraction, integrals))
+    rows = [_star_sums(fraction, integrals, number * w, 0)]
+    rows.append(rows[0] if equal else _star_sums(fraction, integrals, number * w**2, 0))
+    rows.append(_star_sums(fraction, integrals, number * w, 1))
+    rows.append(_star_counts(fraction, integrals, number))
     sums = _weighted_sums(np.unique(fraction), np.concatenate(rows, axis=1), scale)
     first, second, coarse, counts = np.split(sums, np.cumsum([r.shape[1] for r in rows[:-1]]), axis=1)
-    alone = np.ones_like(w) if integrals.single_kept is None else integrals.single_kept
+    alone = number if integrals.single_kept is None else number * integrals.single_kept
     pairs, lost = counts[:, 0], counts[:, 1]
     kept = alone.sum() - lost
     if np.any(kept < _LEAST_KEPT * fraction.size):
         raise InputError(
             "must leave some pairs unresolved at this binary fraction", key="cut", value=population.cut
         )
-    mean_w, mean_w2 = ((alone @ w) - first[:, -1]) / kept, ((alone @ w**2) - second[:, -1]) / kept
+    mean_w = ((alone * w).sum() - first[:, -1]) / kept
+    mean_w2 = ((alone * w**2).sum() - second[:, -1]) / kept
     powers = _square(first, kept * mean_w)
     squares = _square(second, kept * mean_w**2)
     mean, weighted = _isotropic_means(powers, population.cut), _isotropic_means(squares, population.cut)
@@ -171,13 +172,11 @@ def population_moments(
         shift=spread * mean - weighted,
         covariance=covariance,
         powers=powers,
-        relative_error=_relative_error(powers, _square(coarse, kept * mean_w)),
+        relative_error=_relative_error(powers, _square(coarse, kept * mean_w), integrals.joint is None),
     )
 
 
-def _star_sums(
-    fraction: FloatArray, integrals: PairIntegrals, weight: FloatArray, rule: int
-) -> FloatArray:
+def _star_sums(fraction: FloatArray, integrals: PairIntegrals, weight: FloatArray, rule: int) -> FloatArray:
     """Sums over the stars of each multiplicity fraction, ascending: powers by a rule, and the weight lost to pairs."""
     values, which = np.unique(fraction, return_inverse=True)
     order = np.argsort(which, kind="stable")
@@ -190,12 +189,13 @@ def _star_sums(
     return out
 
 
-def _star_counts(fraction: FloatArray, integrals: PairIntegrals) -> FloatArray:
+def _star_counts(fraction: FloatArray, integrals: PairIntegrals, number: FloatArray) -> FloatArray:
     """Stars of each multiplicity fraction: all, what pairs lose against singles, resolved, removed, singles kept."""
     values, which = np.unique(fraction, return_inverse=True)
     alone = np.ones_like(fraction) if integrals.single_kept is None else integrals.single_kept
     columns = [np.ones_like(fraction), integrals.lost, 1 - integrals.unresolved, 1 - integrals.kept, alone]
-    return np.stack([np.bincount(which, weights=c, minlength=values.size) for c in columns], axis=1)
+    sums = [np.bincount(which, weights=number * c, minlength=values.size) for c in columns]
+    return np.stack(sums, axis=1)
 
 
 def _shares(counts: FloatArray, kept: FloatArray, n: int, alone: float) -> dict[str, FloatArray]:
@@ -232,10 +232,16 @@ def _square(sums: FloatArray, total: FloatArray) -> FloatArray:
     return (sums[:, :_POWERS] / total[:, None]).reshape(-1, ORDER + 1, ORDER + 1)
 
 
-def _relative_error(fine: FloatArray, coarse: FloatArray) -> FloatArray:
-    """Largest relative difference between two rules among powers of y r² and mean moments, (k,)."""
+def _relative_error(fine: FloatArray, coarse: FloatArray, smooth: bool) -> FloatArray:
+    """Largest relative difference between two rules among powers of y r² and mean moments, (k,).
+
+    Where a selection has an edge below the cut, high powers of r over the cut are small, badly known and of no
+    consequence: of x and x² alone.
+    """
     values = [
         np.concatenate([p[:, 1:, 1:].reshape(-1, ORDER**2), _isotropic_means(p, 1.0)[:, _SIZES]], axis=1)
+        if smooth
+        else p[:, [1, 2], [1, 2]]
         for p in (fine, coarse)
     ]
     difference = np.divide(

@@ -210,7 +210,7 @@ def _of_bin(setting: Setting, magnitude: tuple[float, float], stars: Stars) -> M
         n_catalog_stars=len(stars),
         uncertainty=known,
         shares=shares,
-        widest_cut=_widest_cuts(setting, population, integrals, shares),
+        widest_cut=_widest_cuts(setting, stars, population, integrals, shares),
     )
 
 
@@ -287,18 +287,22 @@ def _refined(
 
 
 def _widest_cuts(
-    setting: Setting, population: Population, integrals: PairIntegrals, shares: tuple[Share, ...]
+    setting: Setting,
+    stars: Stars,
+    population: Population,
+    integrals: PairIntegrals,
+    shares: tuple[Share, ...],
 ) -> dict[str, float]:
     """Widest cut that meets the requirements of each group, between cuts that are tried, linear in logarithms."""
     required = [s for s in shares if s.required is not None]
-    step = math.ceil(len(population.stars) / MOST_STARS)
+    step = math.ceil(len(stars) / MOST_STARS)
     some = Population.of(
-        population.stars.take(np.arange(0, len(population.stars), step)),
+        stars.take(np.arange(0, len(stars), step)),
         multiplicity=setting.multiplicity,
         photometry=setting.photometry,
         cut=setting.cut,
     )
-    coefficient = integrals.coefficient[:, ::step]
+    coefficient = integrals.coefficient[:, population.law.star % step == 0]
     totals = np.array(
         [_totals(setting, replace(some, cut=setting.cut * f), coefficient, required) for f in CUTS]
     )

@@ -103,7 +103,7 @@ def stars(
         read = catalog_of(config)
     selected = draw_stars(config, read)
     law = config.multiplicity.build().companions(selected.mass)
-    counts = selected.counts(mag, law.multiplicity_fraction)
+    counts = selected.counts(mag, law.multiplicity_fraction[law.first])
     if output is not None:
         write_stars(selected, output)
     if plot is not None:

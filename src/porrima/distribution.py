@@ -221,8 +221,8 @@ def pair_density(
     """
     law, tracks = population.law, population.tracks
     scale = population.scale(None if binary_fraction is None else np.array([binary_fraction]))[0]
-    pair = np.minimum(1.0, scale * law.multiplicity_fraction)
-    pair = pair / np.sum(1.0 - pair * (1.0 - integrals.unresolved))
+    pair, number = np.minimum(1.0, scale * law.multiplicity_fraction), population.abundance
+    pair = number * pair / np.sum(number * (1.0 - pair * (1.0 - integrals.unresolved)))
     place = np.log10(population.cut * population.stars.distance) - law.log_a
     kinds, which = np.unique(
         np.stack([law.log_a_sigma, law.log_a_max - law.log_a], axis=1).round(12), axis=0, return_inverse=True
@@ -232,7 +232,7 @@ def pair_density(
     count, total = np.zeros((len(kinds), n_place, _Y_CELLS)), np.zeros((2, _Y_CELLS))
     _count_pairs(
         tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index, tracks.weight,
-        population.stars.mass, law.mass_ratio_min, law.mass_ratio_exponent, law.mass_ratio,
+        population.stars.mass, law.mass_ratio_min, law.mass_ratio_max, law.mass_ratio_exponent, law.mass_ratio,
         which.ravel(), (place - first) / _PLACE_STEP, pair, count, total,
     )  # fmt: skip
     edge = np.linspace(-_R_DECADES, 0.0, _R_CELLS + 1)
@@ -256,6 +256,7 @@ def _count_pairs(  # type: ignore[no-untyped-def]
     weight,
     mass,
     q_min,
+    q_max,
     exponent,
     given,
     kind,
@@ -272,8 +273,10 @@ def _count_pairs(  # type: ignore[no-untyped-def]
             grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
         )
         g = exponent[s] + 1.0
-        first = min(max(dark_below / mass[s], q_min[s]), 1.0)
-        norm = (1.0 - q_min[s] ** g) / g if abs(g) > 1e-9 else -math.log(q_min[s])
+        first = min(max(dark_below / mass[s], q_min[s]), q_max[s])
+        norm = (q_max[s] ** g - q_min[s] ** g) / g if abs(g) > 1e-9 else math.log(q_max[s] / q_min[s])
+        last = math.log(q_max[s])
+        span = last - math.log(first)
         one = not math.isnan(given[s])
         if one and given[s] * mass[s] < dark_below:
             continue
@@ -281,8 +284,8 @@ def _count_pairs(  # type: ignore[no-untyped-def]
         low = int(place[s])
         upper = place[s] - low
         for k in range(steps):
-            log_q = math.log(given[s]) if one else math.log(first) * (1.0 - (k + 0.5) / steps)
-            share = pair[s] if one else pair[s] * math.exp(g * log_q) / norm * -math.log(first) / steps
+            log_q = math.log(given[s]) if one else last - span * (1.0 - (k + 0.5) / steps)
+            share = pair[s] if one else pair[s] * math.exp(g * log_q) / norm * span / steps
             magnitude = magnitude_on_track(
                 grid, log_mass_min, log_mass + log_q * to_log,
                 i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from porrima.multiplicity import CompanionLaw
     from porrima.orbits import Projection
     from porrima.systems import Population
 
@@ -210,10 +211,13 @@ def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegr
     if not screen.is_empty:
         joint = np.stack(
             [
-                joint_powers(population, screen, rule, intervals // (1 + rule), _moments_below(population, rule))
+                joint_powers(
+                    population, screen, rule, intervals // (1 + rule), starts_of_mass_ratios(population.law),
+                    _moments_below(population, rule),
+                )
                 for rule in (0, 1)
             ]
-        )
+        )  # fmt: skip
     return PairIntegrals(
         cut=population.cut,
         coefficient=coefficient_moments(population, intervals),
@@ -258,12 +262,37 @@ def coefficient_moments(population: Population, intervals: int = _INTERVALS) -> 
         Powers 0 to 8, dimensionless; by all nodes, and by every other.
     """
     law, tracks = population.law, population.tracks
-    moments = np.empty((2, len(population.stars), ORDER + 1))
+    columns = law.mass_ratio_min, law.mass_ratio_max, law.mass_ratio_exponent, law.mass_ratio
+    start = starts_of_mass_ratios(law)
+    moments = np.empty((2, start.size, ORDER + 1))
     _coefficients(
-        tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index, tracks.weight,
-        population.stars.mass, law.mass_ratio_min, law.mass_ratio_exponent, law.mass_ratio, intervals, moments,
+        tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index[start], tracks.weight[start],
+        population.stars.mass[start], *(column[start] for column in columns), intervals, moments,
     )  # fmt: skip
-    return moments
+    return (
+        moments
+        if start.size == law.star.size
+        else np.repeat(moments, np.diff(start, append=law.star.size), axis=1)
+    )
+
+
+def starts_of_mass_ratios(law: CompanionLaw) -> NDArray[np.int64]:
+    """First of each run of classes that share star and mass ratios, and may differ in their orbits.
+
+    Parameters
+    ----------
+    law : CompanionLaw
+        Of m classes.
+
+    Returns
+    -------
+    start : (k,) int array
+        Numbers of rows, ascending from 0 (dimensionless).
+    """
+    is_new = np.diff(law.star, prepend=-1) != 0
+    for column in (law.mass_ratio_min, law.mass_ratio_max, law.mass_ratio_exponent):
+        is_new |= np.diff(column, prepend=np.nan) != 0
+    return np.flatnonzero(is_new)
 
 
 @njit(inline="always")
@@ -277,7 +306,7 @@ def _add_powers(weight, flux_ratio, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True)
 def _coefficients(  # type: ignore[no-untyped-def]
-    grid, log_mass_min, dark_below, index, weight, mass, q_min, exponent, given, intervals, out
+    grid, log_mass_min, dark_below, index, weight, mass, q_min, q_max, exponent, given, intervals, out
 ):
     """E[(4y)^j] of each star by Simpson's rule in ln q, with all nodes and with every other one."""
     to_log, to_exponent = 1.0 / math.log(10.0), -0.4 * math.log(10.0)
@@ -289,18 +318,19 @@ def _coefficients(  # type: ignore[no-untyped-def]
         out[:, s, :] = 0.0
         out[:, s, 0] = 1.0
         g = exponent[s] + 1.0
-        first = min(max(dark_below / mass[s], q_min[s]), 1.0)  # below it companions are dark
-        span, nodes = -math.log(first), intervals + 1
+        first = min(max(dark_below / mass[s], q_min[s]), q_max[s])  # below it companions are dark
+        last, nodes = math.log(q_max[s]), intervals + 1
+        span = last - math.log(first)
         if not math.isnan(given[s]):
-            nodes, span = 1, -math.log(given[s])
+            nodes, last, span = 1, 0.0, -math.log(given[s])
             if given[s] * mass[s] < dark_below:
                 continue
         elif span == 0.0:
             continue
-        norm = (1.0 - q_min[s] ** g) / g if abs(g) > 1e-9 else -math.log(q_min[s])
+        norm = (q_max[s] ** g - q_min[s] ** g) / g if abs(g) > 1e-9 else math.log(q_max[s] / q_min[s])
         h = span / intervals
         for k in range(nodes):
-            log_q = h * k - span
+            log_q = h * k - span + last
             magnitude = magnitude_on_track(
                 grid, log_mass_min, log_mass + log_q * to_log,
                 i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],

@@ -16,42 +16,66 @@ if TYPE_CHECKING:
     from porrima.orbits import Projection
 
     FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
 
 __all__ = ["MULTIPLICITY", "CompanionLaw", "DucheneKraus2013", "MultiplicityModel", "multiplicity_scale"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompanionLaw:
-    r"""Statistics of the companion of each of n stars.
+    r"""Statistics of the companions of n stars: m classes of them, at least one for each star.
+
+    A class is a power law of the mass ratio with a log-normal of the semi-major axis.  A star that has a companion
+    has one of a class of its own with the probability `share`, so that classes make a mixture.
 
     Parameters
     ----------
-    multiplicity_fraction : (n,) float array
-        Probability that the star has a companion, in [0, 1].
-    mass_ratio_exponent : (n,) float array
+    star : (m,) int array
+        Number of the star of each class, from 0 to n - 1, ascending.
+    share : (m,) float array
+        Of the class among the companions of its star, in [0, 1]; the shares of a star sum to 1.
+    multiplicity_fraction : (m,) float array
+        Probability that the star has a companion, in [0, 1]; the same in all its classes.
+    mass_ratio_exponent : (m,) float array
         :math:`\gamma` of :math:`dN/dq \propto q^\gamma`, dimensionless.
-    mass_ratio_min : (n,) float array
-        Least mass ratio, in (0, 1).
-    log_a : (n,) float array
+    mass_ratio_min, mass_ratio_max : (m,) float array
+        Range of the mass ratio, in (0, 1].
+    log_a : (m,) float array
         Mean of log10 of the semi-major axis in au, before any truncation.
-    log_a_sigma : (n,) float array
+    log_a_sigma : (m,) float array
         Its standard deviation, in dex.
-    log_a_max : (n,) float array
+    log_a_max : (m,) float array
         log10 of the largest semi-major axis in au; infinite where there is none.
-    mass_ratio : (n,) float array
+    mass_ratio : (m,) float array
         The mass ratio itself where a catalogue gives it, in (0, 1]; NaN where it is drawn.
     """
 
+    star: IntArray
+    share: FloatArray
     multiplicity_fraction: FloatArray
     mass_ratio_exponent: FloatArray
     mass_ratio_min: FloatArray
+    mass_ratio_max: FloatArray
     log_a: FloatArray
     log_a_sigma: FloatArray
     log_a_max: FloatArray
     mass_ratio: FloatArray
 
+    @property
+    def first(self) -> IntArray:
+        """First class of each star, (n,)."""
+        starts: IntArray = np.flatnonzero(np.diff(self.star, prepend=-1))
+        return starts
+
+    @property
+    def abundance(self) -> FloatArray:
+        """Share of each class among the stars over the mean one, (m,): its weight in averages over stars."""
+        return self.share * (self.star.size / self.first.size)
+
     def with_given(self, mass_ratio: FloatArray) -> CompanionLaw:
         """The law with the pairs that a catalogue has made: their mass ratios fixed, its single stars single.
+
+        Classes keep their shares, whatever the mass ratio.
 
         Parameters
         ----------
@@ -63,6 +87,7 @@ class CompanionLaw:
         law : CompanionLaw
             Orbits as before, in log10 au.
         """
+        mass_ratio = mass_ratio[self.star]
         return replace(
             self,
             multiplicity_fraction=np.where(
@@ -203,9 +228,12 @@ class DucheneKraus2013:
         log_a = np.log10(table[:, 4])
         beyond = math.inf if self.a_max_factor is None else math.log10(self.a_max_factor)
         return CompanionLaw(
+            star=np.arange(mass.size),
+            share=np.ones(mass.shape),
             multiplicity_fraction=table[:, 2],
             mass_ratio_exponent=table[:, 3],
             mass_ratio_min=np.full(mass.shape, self.mass_ratio_min),
+            mass_ratio_max=np.ones(mass.shape),
             log_a=log_a,
             log_a_sigma=2.0 / 3.0 * self.scatter_scale * table[:, 5],
             log_a_max=log_a + beyond,
@@ -220,7 +248,9 @@ MULTIPLICITY: dict[str, DucheneKraus2013] = {
 """Models by name; ``dk13-kcm16`` is the variant that reproduces the magnitude dependence of KCM16."""
 
 
-def multiplicity_scale(multiplicity_fraction: FloatArray, binary_fraction: FloatArray) -> FloatArray:
+def multiplicity_scale(
+    multiplicity_fraction: FloatArray, binary_fraction: FloatArray, abundance: FloatArray | None = None
+) -> FloatArray:
     r"""Factor s that scales every star's multiplicity fraction so that a population has a binary fraction F.
 
     Parameters
@@ -229,6 +259,8 @@ def multiplicity_scale(multiplicity_fraction: FloatArray, binary_fraction: Float
         Of each star as the model gives it, in [0, 1].
     binary_fraction : (k,) float array
         Wanted mean over the stars, in [0, 1].
+    abundance : (n,) float array, optional
+        Weight of each star in that mean, of mean 1 (dimensionless); all alike where not given.
 
     Returns
     -------
@@ -254,13 +286,15 @@ def multiplicity_scale(multiplicity_fraction: FloatArray, binary_fraction: Float
         raise ValueError(
             f"binary_fraction must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}"
         )
-    ascending = np.sort(multiplicity_fraction)
+    order = np.argsort(multiplicity_fraction, kind="stable")
+    ascending = multiplicity_fraction[order]
+    number = np.ones_like(ascending) if abundance is None else abundance[order]
     values, first = np.unique(ascending, return_index=True)
     values, first = values[values > 0], first[values > 0]
-    sum_below = np.concatenate([[0.0], np.cumsum(ascending)])[first]
-    reached = np.concatenate(
-        [[0.0], ((sum_below / values + (ascending.size - first)) / ascending.size)[::-1]]
-    )
+    sum_below = np.concatenate([[0.0], np.cumsum(number * ascending)])[first]
+    number_below = np.concatenate([[0.0], np.cumsum(number)])
+    above = number_below[-1] - number_below[first]
+    reached = np.concatenate([[0.0], ((sum_below / values + above) / number_below[-1])[::-1]])
     if np.any(wanted > reached[-1] * (1 + 1e-12)):
         raise ValueError(
             f"binary_fraction must be at most {reached[-1]:.6g} for these stars, got {wanted.max()}"

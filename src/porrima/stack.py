@@ -183,7 +183,7 @@ def _fractions(
         _uniform_fractions(np.uint64(seed), first, fractions)
         return fractions
     if binary_fraction == "model":
-        return np.full(last - first, population.law.multiplicity_fraction.mean())
+        return np.full(last - first, (population.abundance * population.law.multiplicity_fraction).mean())
     if not 0 <= float(binary_fraction) <= 1:
         raise ValueError(f"binary_fraction must be in [0, 1], got {binary_fraction}")
     return np.full(last - first, float(binary_fraction))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -41,9 +41,9 @@ class Population:
     Parameters
     ----------
     stars : Stars
-        The n primaries, with the magnitude of the whole system.
+        The primaries, with the magnitude of the whole system: n rows, each star once for every class of companions.
     law : CompanionLaw
-        Statistics of their companions.
+        Statistics of their companions, a class to a row.
     tracks : Tracks
         Mass-luminosity relation with each star's place in it.
     projection : {"isotropic", "inclination-uniform"}
@@ -95,7 +95,7 @@ class Population:
         Returns
         -------
         population : Population
-            Of the n stars.
+            Of these stars.
 
         Raises
         ------
@@ -115,10 +115,24 @@ class Population:
             raise InputError(str(error), source=stars.source or None) from None
         flux = 10.0 ** (-0.4 * (stars.magnitude - stars.magnitude.min()))
         weight = flux / flux.mean() if stack_weight == "flux" else np.ones(len(stars))
+        if law.star.size > len(stars):
+            stars, weight = stars.take(law.star), weight[law.star]
+            tracks = replace(tracks, index=tracks.index[law.star], weight=tracks.weight[law.star])
         return cls(
             stars=stars, law=law, tracks=tracks, projection=multiplicity.projection, cut=cut, weight=weight,
             selection=selection,
         )  # fmt: skip
+
+    @property
+    def abundance(self) -> FloatArray:
+        """How much each row counts among the stars, (n,), with mean 1; 1 where stars have one class of companions."""
+        return self.law.abundance
+
+    @property
+    def primaries(self) -> Stars:
+        """The stars, each once."""
+        first = self.law.first
+        return self.stars if first.size == len(self.stars) else self.stars.take(first)
 
     def scale(self, binary_fraction: FloatArray | None) -> FloatArray:
         """Factor on all multiplicity fractions for each wanted binary fraction; see `multiplicity_scale`.
@@ -135,7 +149,7 @@ class Population:
         """
         if binary_fraction is None:
             return np.ones(1)
-        return multiplicity_scale(self.law.multiplicity_fraction, binary_fraction)
+        return multiplicity_scale(self.law.multiplicity_fraction, binary_fraction, self.abundance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

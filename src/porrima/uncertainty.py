@@ -285,10 +285,12 @@ class _Judge:
         """Standard error of the quantities from the finite number of stars, (n_name,): that of a ratio of sums."""
         own = population.law.multiplicity_fraction
         pair = np.minimum(1.0, population.scale(self.fraction)[0] * own)
-        kept = 1.0 - pair * (1.0 - integrals.unresolved)
+        star, number = population.law.star, population.abundance
+        kept = np.bincount(star, number * (1.0 - pair * (1.0 - integrals.unresolved)))
         relative = []
         for power in (1, 2):
             x = pair * integrals.coefficient[0, :, power] * integrals.separation[0, :, power]
+            x = np.bincount(star, number * x)
             rest = x - kept * (x.sum() / kept.sum())
             relative.append(np.sqrt(rest @ rest) / x.sum() if x.sum() > 0 else 0.0)
         ratio = 1.0 + np.repeat([relative[0], 0.5 * relative[1]], [4, 3])
