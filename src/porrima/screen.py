@@ -39,7 +39,7 @@ SQUARE = np.append(0.0, np.logspace(-6, 0, 6 * PER_DECADE + 1))
 MAGNITUDE_STEP = 0.05
 """Largest distance of nodes in magnitude, in mag: a star is at most half of it from its own."""
 
-_LEAST_KEPT = 1e-6  # share of single stars that must be left
+_LEAST_KEPT = 1e-3  # share of single stars that must be left
 
 
 class Screen(NamedTuple):
