@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -181,10 +182,33 @@ def shape_grid(
     InputError
         If the largest separation is too wide for kernel moments.
     """
-    mean, spread = own_shape(response, quantity, separation[None, :], flux_ratio[:, None])
+    return _shape_grid(_Behind(response), quantity, separation.tobytes(), flux_ratio.tobytes())
+
+
+class _Behind:
+    """A response as a key: itself, not its arrays, which many clips of one PSF share."""
+
+    __slots__ = ("response",)
+
+    def __init__(self, response: Response) -> None:
+        self.response = response
+
+    def __hash__(self) -> int:
+        return id(self.response)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Behind) and self.response is other.response
+
+
+@lru_cache(maxsize=16)
+def _shape_grid(behind: _Behind, quantity: ClippedQuantity, r_bytes: bytes, f_bytes: bytes) -> OwnShape:
+    """What `shape_grid` keeps."""
+    separation, flux_ratio = np.frombuffer(r_bytes), np.frombuffer(f_bytes)
+    mean, spread = own_shape(behind.response, quantity, separation[None, :], flux_ratio[:, None])
     if np.isnan(mean).any():
         widest = separation[np.argmax(np.isnan(mean).any(axis=0)) - 1]
-        rule = f"is too wide to clip stars by their shape behind {response.psf}: at most {widest:.3g} arcsec"
+        name = behind.response.psf
+        rule = f"is too wide to clip stars by their shape behind {name}: at most {widest:.3g} arcsec"
         raise InputError(rule, key="cut", value=f"{separation[-1]:.4g}")
     for k in np.flatnonzero(np.isinf(mean).any(axis=0)):
         beyond, growth = np.isinf(mean[:, k]), (separation[k] / separation[k - 1]) ** 2

@@ -35,7 +35,10 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
-__all__ = ["EVEN", "PRODUCTS", "PairIntegrals", "coefficient_polynomial", "integrate", "separation_moments"]
+__all__ = [
+    "EVEN", "PRODUCTS", "PairIntegrals", "coefficient_polynomial", "integrate", "separation_moments", "separations_below",
+    "starts_of_mass_ratios",
+]  # fmt: skip
 
 EVEN = tuple(range(2, ORDER + 1, 2))
 """Orders of the moments that do not vanish in the mean."""
@@ -213,7 +216,7 @@ def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegr
             [
                 joint_powers(
                     population, screen, rule, intervals // (1 + rule), starts_of_mass_ratios(population.law),
-                    _moments_below(population, rule),
+                    separations_below(population, rule),
                 )
                 for rule in (0, 1)
             ]
@@ -227,8 +230,22 @@ def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegr
     )
 
 
-def _moments_below(population: Population, rule: int) -> Callable[[IntArray, FloatArray], FloatArray]:
-    """Logarithms of the partial moments of some stars at some fractions of the cut (dex), over these."""
+def separations_below(population: Population, rule: int) -> Callable[[IntArray, FloatArray], FloatArray]:
+    """Partial moments of the separation of some rows below some fractions of the cut.
+
+    Parameters
+    ----------
+    population : Population
+        Of n rows.
+    rule : {0, 1}
+        The rule in use or the coarser one.
+
+    Returns
+    -------
+    moments : callable
+        From the numbers (m,) of rows and fractions (k,) in dex to logarithms (m, k, 9) of the even moments of the
+        separation below each fraction, over it (dimensionless).
+    """
     law = population.law
     place = np.log10(population.cut * population.stars.distance) - law.log_a
     scatter, beyond = law.log_a_sigma.round(12), (law.log_a_max - law.log_a).round(12)

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 __all__ = [
-    "FOUR_Y", "MAGNITUDE_STEP", "SQUARE", "Screen", "flux_ratio_of", "no_screen", "screen_grid", "screen_of",
+    "FOUR_Y", "MAGNITUDE_STEP", "PER_DECADE", "SQUARE", "Screen", "flux_ratio_of", "magnitude_nodes",
+    "no_screen", "screen_of",
 ]  # fmt: skip
 
 PER_DECADE = 20
@@ -124,36 +125,37 @@ def no_screen() -> Screen:
     )
 
 
-def screen_grid(cut: float, magnitude: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Nodes of the grid of some stars.
+def magnitude_nodes(magnitude: FloatArray, n: int | None = None) -> tuple[FloatArray, NDArray[np.int32]]:
+    """Nodes of magnitude that serve some stars, and the nearest to each star.
 
     Parameters
     ----------
-    cut : float
-        In arcsec.
-    magnitude : (n,) float array
+    magnitude : (n_star,) float array
         Of the stars, in mag.
+    n : int, optional
+        Nodes (count); as many as `MAGNITUDE_STEP` asks for where not given.
 
     Returns
     -------
-    separation, flux_ratio, magnitude : (n_r,), (n_f,), (n_m,) float array
-        In arcsec, dimensionless, and mag.
+    nodes, number : (n,) float array, (n_star,) int array
+        In mag, and the number of each star's node.
     """
     low, high = float(magnitude.min()), float(magnitude.max())
-    n = 1 + math.ceil((high - low) / MAGNITUDE_STEP - 1e-9)
-    return cut * np.sqrt(SQUARE), flux_ratio_of(FOUR_Y), np.linspace(low, high, n)
+    if n is None:
+        n = 1 + math.ceil((high - low) / MAGNITUDE_STEP - 1e-9)
+    step = (high - low) / (n - 1) if n > 1 else np.inf
+    return np.linspace(low, high, n), np.rint((magnitude - low) / step).astype(np.int32)
 
 
 @lru_cache(maxsize=8)
 def _screen(selection: Selection, cut: float, stars: bytes) -> Screen:
     """What `screen_of` keeps, as changes of a population leave it as it is."""
-    own = np.frombuffer(stars)
-    separation, flux_ratio, magnitude = screen_grid(cut, own)
+    separation, flux_ratio = cut * np.sqrt(SQUARE), flux_ratio_of(FOUR_Y)
+    magnitude, number = magnitude_nodes(np.frombuffer(stars))
     layers = selection.layers(separation, flux_ratio, magnitude)
     n_m = max(layer.score.shape[0] for layer in layers)
-    nodes = np.linspace(magnitude[0], magnitude[-1], n_m)
-    step = (magnitude[-1] - magnitude[0]) / max(n_m - 1, 1)
-    number = np.rint((own - nodes[0]) / step).astype(np.int32) if n_m > 1 else np.zeros(own.size, np.int32)
+    if n_m == 1:
+        number = np.zeros_like(number)
     score = np.stack(
         [np.broadcast_to(layer.score, (n_m, flux_ratio.size, separation.size)) for layer in layers]
     )
