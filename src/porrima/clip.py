@@ -92,7 +92,7 @@ class Noise:
             outside = m.min() if m.min() < low else m.max()
             rule = f"must be given for the magnitudes of all stars, not from {low:g} to {high:g} alone"
             raise InputError(rule, key="selection.noise", value=f"a star of {outside:.4g}")
-        return np.exp(np.interp(m, self.magnitude, np.log(self.sigma)))
+        return np.asarray(np.exp(np.interp(m, self.magnitude, np.log(self.sigma))))
 
 
 class OwnShape(NamedTuple):
@@ -222,18 +222,18 @@ def score(own: OwnShape, quantity: ClippedQuantity, threshold: float, sigma: Flo
     Parameters
     ----------
     own : OwnShape
-        (...) arrays, dimensionless.
+        (n,) arrays, or more axes, dimensionless.
     quantity : {"r2", "e"}
         What is clipped.
     threshold : float
         Dimensionless, positive.
-    sigma : (...) float array
+    sigma : (n,) float array
         Standard deviation of the noise, 0 for none, of the relative R² or of a component of e (dimensionless).
 
     Returns
     -------
-    score : (...) float array
-        Dimensionless.
+    score : (n,) float array
+        Dimensionless, of the shape of both together.
 
     Notes
     -----
@@ -286,7 +286,7 @@ class Clip:
     response: Response
     threshold: float
     quantity: ClippedQuantity = "r2"
-    noise: Noise = Noise()  # noqa: RUF009  (frozen)
+    noise: Noise = Noise()
 
     def __post_init__(self) -> None:
         if not 0 < self.threshold <= _LARGEST:

@@ -217,7 +217,7 @@ def count_pairs(population: Population, binary_fraction: float | None = None) ->
         magnitude=magnitude,
         four_y=four_y,
         powers=powers,
-        single=np.bincount(node, weights=number * (1 - pair), minlength=magnitude.size),
+        single=np.bincount(node, weights=number * (1 - pair), minlength=magnitude.size).astype(float),
         pairs=float(np.sum(number * pair)),
         resolved=float(np.sum(number * pair * (1 - inside))),
     )

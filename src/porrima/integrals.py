@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int64]
 
 __all__ = [
-    "EVEN", "PRODUCTS", "PairIntegrals", "coefficient_polynomial", "integrate", "separation_moments", "separations_below",
-    "starts_of_mass_ratios",
+    "EVEN", "PRODUCTS", "PairIntegrals", "coefficient_polynomial", "integrate", "separation_moments",
+    "separations_below", "starts_of_mass_ratios",
 ]  # fmt: skip
 
 EVEN = tuple(range(2, ORDER + 1, 2))

@@ -163,7 +163,7 @@ def _normal_law(z):  # type: ignore[no-untyped-def]
 
 @njit
 def kept_cells(normal, scores, mean, lean):  # type: ignore[no-untyped-def]
-    """What a row of scores keeps in each interval: its mean, and that times (s - 1/2); both go on from what is there."""
+    """Mean of what a row of scores keeps in each interval, and of that times (s - 1/2), after what was kept before."""
     p0, d0 = _normal_law(scores[0]) if normal else (scores[0], 0.0)
     for c in range(mean.size):
         z0, z1 = scores[c], scores[c + 1]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from scipy.special import ndtr
@@ -16,6 +16,8 @@ from scipy.special import ndtr
 from porrima.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Hashable
+
     from numpy.typing import NDArray
 
     from porrima.selection import Selection
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 __all__ = [
-    "FOUR_Y", "MAGNITUDE_STEP", "PER_DECADE", "SQUARE", "Screen", "flux_ratio_of", "magnitude_nodes",
+    "FOUR_Y", "MAGNITUDE_STEP", "PER_DECADE", "SQUARE", "Screen", "flux_ratio_of", "kept_share", "magnitude_nodes",
     "no_screen", "screen_of",
 ]  # fmt: skip
 
@@ -100,7 +102,9 @@ def screen_of(population: Population) -> Screen:
     """
     if population.selection is None:
         return no_screen()
-    return _screen(population.selection, population.cut, population.stars.magnitude.tobytes())
+    return _screen(
+        cast("Hashable", population.selection), population.cut, population.stars.magnitude.tobytes()
+    )
 
 
 def no_screen() -> Screen:
@@ -147,12 +151,37 @@ def magnitude_nodes(magnitude: FloatArray, n: int | None = None) -> tuple[FloatA
     return np.linspace(low, high, n), np.rint((magnitude - low) / step).astype(np.int32)
 
 
+def kept_share(screen: Screen, number: int, four_y: FloatArray, square: FloatArray) -> FloatArray:
+    """Probability that pairs of one node of magnitude are kept.
+
+    Parameters
+    ----------
+    screen : Screen
+        Of the population.
+    number : int
+        Node of magnitude (count).
+    four_y, square : (n,), (m,) float array
+        4 f/(1+f)², and the square of the separation over the cut, in [0, 1].
+
+    Returns
+    -------
+    kept : (n, m) float array
+        In [0, 1].
+    """
+    kept = np.ones((four_y.size, square.size))
+    for score, normal in zip(screen.score[:, number], screen.normal, strict=True):
+        rows = np.stack([np.interp(square, SQUARE, row) for row in score])
+        found = np.stack([np.interp(four_y, FOUR_Y, column) for column in rows.T], axis=1)
+        kept *= 1.0 - (ndtr(found) if normal else found)
+    return kept
+
+
 @lru_cache(maxsize=8)
-def _screen(selection: Selection, cut: float, stars: bytes) -> Screen:
+def _screen(selection: Hashable, cut: float, stars: bytes) -> Screen:
     """What `screen_of` keeps, as changes of a population leave it as it is."""
     separation, flux_ratio = cut * np.sqrt(SQUARE), flux_ratio_of(FOUR_Y)
     magnitude, number = magnitude_nodes(np.frombuffer(stars))
-    layers = selection.layers(separation, flux_ratio, magnitude)
+    layers = cast("Selection", selection).layers(separation, flux_ratio, magnitude)
     n_m = max(layer.score.shape[0] for layer in layers)
     if n_m == 1:
         number = np.zeros_like(number)

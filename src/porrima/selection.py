@@ -376,16 +376,15 @@ def _gridded(
     grid = np.full([nodes[name].size for name in _AXES], np.nan)
     alone = np.full(nodes["magnitude"].size, np.nan)
     for k in range(row.size):
-        at = tuple(n[k] for n in number)
-        if at[0] >= alone.size or nodes["magnitude"][at[0]] != axes["magnitude"][k].round(9):
-            rule = "must be a magnitude of pairs, too"
-            raise InputError(
-                rule, source=path, row=int(row[k]), column="magnitude", value=axes["magnitude"][k]
-            )
-        place: tuple[FloatArray, object] = (grid, at) if pairs[k] else (alone, at[0])
-        if not np.isnan(place[0][place[1]]):  # type: ignore[index]
+        m, c, r = (n[k] for n in number)
+        if m >= alone.size or nodes["magnitude"][m] != axes["magnitude"][k].round(9):
+            rule, value = "must be a magnitude of pairs, too", axes["magnitude"][k]
+            raise InputError(rule, source=path, row=int(row[k]), column="magnitude", value=value)
+        line = grid[m, c] if pairs[k] else alone
+        at = r if pairs[k] else m
+        if not np.isnan(line[at]):
             raise InputError("stands twice in the grid", source=path, row=int(row[k]))
-        place[0][place[1]] = probability[k]  # type: ignore[index]
+        line[at] = probability[k]
     gaps = np.argwhere(np.isnan(grid))
     if gaps.size:
         where = ", ".join(f"{name} {nodes[name][i]:g}" for name, i in zip(_AXES, gaps[0], strict=True))

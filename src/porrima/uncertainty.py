@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from porrima.photometry import MassLuminosity
     from porrima.prediction import Prediction
     from porrima.response import Response
+    from porrima.selection import Selection
     from porrima.stars import Stars
 
     FloatArray = NDArray[np.float64]
@@ -152,6 +153,7 @@ def uncertainty(
     row_errors: tuple[RowErrors, ...] = ROW_ERRORS,
     cut_error: float = CUT_ERROR,
     integrals: PairIntegrals | None = None,
+    selection: Selection | None = None,
 ) -> Uncertainty:
     r"""Interval of a prediction from the errors of the multiplicity table and the choices of the models.
 
@@ -178,6 +180,8 @@ def uncertainty(
         Relative error of the cut, in [0, 1).
     integrals : PairIntegrals, optional
         Of the population with the models as given, where they are known already.
+    selection : Selection, optional
+        What else the survey rejects, taken as exact.
 
     Returns
     -------
@@ -206,7 +210,7 @@ def uncertainty(
     """
     if not 0 <= cut_error < 1:
         raise ValueError(f"cut_error must be in [0, 1), got {cut_error}")
-    models = {"multiplicity": multiplicity, "photometry": photometry, "cut": cut}
+    models = {"multiplicity": multiplicity, "photometry": photometry, "cut": cut, "selection": selection}
     whole = Population.of(stars, **models)  # type: ignore[arg-type]
     integrals = integrate(whole) if integrals is None else integrals
     fraction = None if binary_fraction is None else np.array([binary_fraction])
@@ -286,11 +290,11 @@ class _Judge:
         own = population.law.multiplicity_fraction
         pair = np.minimum(1.0, population.scale(self.fraction)[0] * own)
         star, number = population.law.star, population.abundance
-        kept = np.bincount(star, number * (1.0 - pair * (1.0 - integrals.unresolved)))
+        alone = 1.0 if integrals.single_kept is None else integrals.single_kept
+        kept = np.bincount(star, number * (alone - pair * integrals.lost))
         relative = []
         for power in (1, 2):
-            x = pair * integrals.coefficient[0, :, power] * integrals.separation[0, :, power]
-            x = np.bincount(star, number * x)
+            x = np.bincount(star, number * pair * integrals.power(power, power))
             rest = x - kept * (x.sum() / kept.sum())
             relative.append(np.sqrt(rest @ rest) / x.sum() if x.sum() > 0 else 0.0)
         ratio = 1.0 + np.repeat([relative[0], 0.5 * relative[1]], [4, 3])
@@ -345,6 +349,8 @@ def _moved(
 
 def _rough(population: Population) -> PairIntegrals:
     """Integrals good enough for changes."""
+    if population.selection is not None:
+        return integrate(population, _INTERVALS)
     return PairIntegrals(
         cut=population.cut,
         coefficient=coefficient_moments(population, _INTERVALS),
@@ -356,6 +362,8 @@ def _again(population: Population, integrals: PairIntegrals, moved: str) -> Pair
     """Integrals of a population of which one figure has moved: only what depends on it is found anew."""
     if moved == "multiplicity_fraction":
         return integrals
+    if population.selection is not None:
+        return _rough(population)
     if moved == "mass_ratio_exponent":
         return replace(integrals, coefficient=coefficient_moments(population, _INTERVALS))
     return replace(integrals, cut=population.cut, separation=separation_moments(population))
@@ -392,8 +400,8 @@ def _choices(
             projection=other_projection if other[2] else model.projection,
         )
         light = other_photometry if other[0] else photometry
-        population = Population.of(stars, multiplicity=chosen, photometry=light, cut=models["cut"])
-        if other[2]:  # the mass ratio knows nothing of the projection
+        population = Population.of(stars, **models | {"multiplicity": chosen, "photometry": light})
+        if other[2] and population.selection is None:  # the mass ratio knows nothing of the projection
             coefficient = out[*other[:2], False][1].coefficient
             integrals = PairIntegrals(
                 cut=population.cut, coefficient=coefficient, separation=separation_moments(population)
