@@ -65,12 +65,12 @@ class Selection(Protocol):
     """Which systems a survey rejects."""
 
     def rejected(self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray) -> FloatArray:
-        """Probability to be rejected, in [0, 1]: arrays of one shape, in arcsec, [0, 1] and mag."""
+        """Probability to be rejected, in [0, 1], (n,) float array: of pairs in arcsec, flux ratio and mag."""
 
     def layers(
         self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray
     ) -> tuple[Layer, ...]:
-        """Factors of what is kept, on a grid: (n_r,) float array [arcsec] from 0, (n_f,) from 0, (n_m,) [mag]."""
+        """Factors of what is kept, on a grid: (n_r,) float array from 0 in arcsec, (n_f,) from 0, (n_m,) in mag."""
 
 
 def probability_layer(
