@@ -62,7 +62,7 @@ X, Y, SEPARATION, FLUX_RATIO, KEPT, VALID = (row * LANES for row in range(6))
 """Rows of a block: companion from primary and the length of that in `pairs.CUT`, flux ratio, weight in the stack (0
 where the pair is resolved or not wanted), and 1, or 0 where there are too many of its star."""
 
-_MASS, _PLACE, _NUMBER, _ROW_NUMBER, _AXIS, _TAIL_X, _TAIL_W, _LEFT, _RIGHT = (
+_MASS, _PLACE, NUMBER, _ROW_NUMBER, _AXIS, _TAIL_X, _TAIL_W, _LEFT, _RIGHT = (
     row * LANES for row in range(6, 15)
 )
 """More rows: log2 of the companion's mass and its place on the grid; as bits, the number of the star and of a row of
@@ -130,7 +130,7 @@ def _take_stars(_context, star, block):  # type: ignore[no-untyped-def]
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         rows = _Rows(context, builder, signature.args, arguments)
         for lane, column in ((lane, column) for lane in range(0, LANES, 8) for column in (0, 4)):
-            fours = [rows.load(0, rows.number(_NUMBER + lane + k), WIDTH, column, 4) for k in range(8)]
+            fours = [rows.load(0, rows.number(NUMBER + lane + k), WIDTH, column, 4) for k in range(8)]
             a, b, c, d = (rows.mixed(fours[k], fours[k + 4], list(range(8))) for k in range(4))
             (a, b), (c, d) = rows.woven(a, b, 1), rows.woven(c, d, 1)
             for k, turned in enumerate((*rows.woven(a, c, 2), *rows.woven(b, d, 2))):
@@ -148,7 +148,7 @@ def _take_tracks(_context, star, track, block):  # type: ignore[no-untyped-def]
         rows = _Rows(context, builder, signature.args, arguments)
 
         def weighed(lane: int) -> Any:
-            own = rows.number(_NUMBER + lane)
+            own = rows.number(NUMBER + lane)
             weight, dimming = rows.load(0, own, WIDTH, W0, 4), rows.load(0, own, WIDTH, DIMMING, 1)
             row = rows.load(1, rows.number(_ROW_NUMBER + lane), 8, 0, 8)
             product = builder.fmul(row, rows.mixed(weight, weight, [0, 1, 2, 3] * 2), flags=("contract",))
@@ -222,7 +222,7 @@ def _draw_words(isotropic, block, key_low, key_high, stack_low, stack_high, firs
 @_loop
 def _primaries(alias, block):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
-        block[_NUMBER + lane] = from_bits(int32(primary(uint32(bits(block[_WORD + lane])), alias)))
+        block[NUMBER + lane] = from_bits(int32(primary(uint32(bits(block[_WORD + lane])), alias)))
 
 
 @_loop
@@ -289,7 +289,7 @@ def _validity(scale, is_capped, star, block):  # type: ignore[no-untyped-def]
         for lane in range(LANES):
             mass_word = uint32(bits(block[_WORD + LANES + lane]))
             axis_word = uint32(bits(block[_WORD + 2 * LANES + lane]))
-            fraction = star[bits(block[_NUMBER + lane]), FRACTION]
+            fraction = star[bits(block[NUMBER + lane]), FRACTION]
             block[VALID + lane] = float32(not is_too_many(mass_word, axis_word, scale, fraction))
 
 
@@ -353,7 +353,7 @@ def weigh_block(weight, block):  # type: ignore[no-untyped-def]
     """Total weight of the kept pairs of a block, each given that of its star."""
     total = 0.0
     for lane in range(LANES):
-        block[KEPT + lane] *= weight[bits(block[_NUMBER + lane])]
+        block[KEPT + lane] *= weight[bits(block[NUMBER + lane])]
         total += block[KEPT + lane]
     return total
 

@@ -164,6 +164,9 @@ def predict(
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
     cut: Annotated[float, typer.Option(help="Separation from which a pair is resolved [arcsec].")] = 0.05,
+    selection: Annotated[
+        str | None, typer.Option(help="Table of what is rejected, or {clip: T, noise: SIGMA, ...}.")
+    ] = None,
     stack_weight: Annotated[str, typer.Option(help="equal, or flux.")] = "equal",
     seed: Seed = 1,
     as_json: Json = False,
@@ -181,7 +184,7 @@ def predict(
         raise InputError("must be at least 1", key="--n-stars", value=n_stars)
     config = population_config(
         l=l, b=b, catalog=catalog, format=format, map=map, options=options, band=band, mag=mag, seed=seed,
-        multiplicity=multiplicity, photometry=photometry, cut=cut, stack_weight=stack_weight,
+        multiplicity=multiplicity, photometry=photometry, cut=cut, selection=selection, stack_weight=stack_weight,
     )  # fmt: skip
     profile = psf_from_name(psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter)
     reply = response(profile, estimator_from_name(estimator))

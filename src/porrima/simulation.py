@@ -186,8 +186,12 @@ class _Run:
     @property
     def identity(self) -> str:
         """Hash of all that the numbers depend on."""
-        rest = self.config.model_copy(update={"stars": None})  # wherever the stars came from, here they are
+        rest, table = self.config.model_copy(update={"stars": None}), None  # wherever the stars came from
+        if rest.selection is not None and rest.selection.table is not None:
+            table = rest.selection.table.read_bytes()
+            rest = rest.model_copy(update={"selection": rest.selection.model_copy(update={"table": None})})
         digest = hashlib.sha256(f"{canonical(rest)} {self.method} {self.device} {__version__}".encode())
+        digest.update(table or b"")
         stars = self.population.primaries
         digest.update(stars.band.encode())
         for shape in self.alone.T:  # a file of a PSF's name may have changed

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from porrima.companions import CompanionLaw, MultiplicityModel
     from porrima.orbits import Projection
     from porrima.photometry import MassLuminosity, Tracks
+    from porrima.selection import Selection
     from porrima.stars import Stars
 
     FloatArray = NDArray[np.float64]
@@ -51,6 +52,8 @@ class Population:
         Projected separation at or above which a pair is resolved and leaves the sample, in arcsec.
     weight : (n,) float array
         Weight of each star's unit-flux image in a stack, dimensionless, with mean 1.
+    selection : Selection or None
+        What else the survey rejects, single stars among it.
     """
 
     stars: Stars
@@ -59,6 +62,7 @@ class Population:
     projection: Projection
     cut: float
     weight: FloatArray
+    selection: Selection | None = None
 
     @classmethod
     def of(
@@ -69,6 +73,7 @@ class Population:
         photometry: MassLuminosity,
         cut: float = 0.05,
         stack_weight: StackWeight = "equal",
+        selection: Selection | None = None,
     ) -> Population:
         """Population of given stars.
 
@@ -84,6 +89,8 @@ class Population:
             Separation from which a pair is resolved, in arcsec, positive.
         stack_weight : {"equal", "flux"}
             Whether every star counts alike in a stack, or in proportion to its flux.
+        selection : Selection, optional
+            What else the survey rejects.
 
         Returns
         -------
@@ -112,8 +119,9 @@ class Population:
             stars, weight = stars.take(law.star), weight[law.star]
             tracks = replace(tracks, index=tracks.index[law.star], weight=tracks.weight[law.star])
         return cls(
-            stars=stars, law=law, tracks=tracks, projection=multiplicity.projection, cut=cut, weight=weight
-        )
+            stars=stars, law=law, tracks=tracks, projection=multiplicity.projection, cut=cut, weight=weight,
+            selection=selection,
+        )  # fmt: skip
 
     @property
     def abundance(self) -> FloatArray:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from porrima.photometry import MassLuminosity
     from porrima.prediction import Prediction
     from porrima.response import Response
+    from porrima.selection import Selection
     from porrima.stars import Stars
 
     FloatArray = NDArray[np.float64]
@@ -146,6 +147,7 @@ def uncertainty(
     row_errors: tuple[RowErrors, ...] | None = None,
     cut_error: float = CUT_ERROR,
     integrals: PairIntegrals | None = None,
+    selection: Selection | None = None,
 ) -> Uncertainty:
     r"""Interval of a prediction from the errors of the multiplicity table and the choices of the models.
 
@@ -172,6 +174,8 @@ def uncertainty(
         Relative error of the cut, in [0, 1).
     integrals : PairIntegrals, optional
         Of the population with the models as given, where they are known already.
+    selection : Selection, optional
+        What else the survey rejects, taken as exact.
 
     Returns
     -------
@@ -204,7 +208,7 @@ def uncertainty(
     """
     if not 0 <= cut_error < 1:
         raise ValueError(f"cut_error must be in [0, 1), got {cut_error}")
-    models = {"multiplicity": multiplicity, "photometry": photometry, "cut": cut}
+    models = {"multiplicity": multiplicity, "photometry": photometry, "cut": cut, "selection": selection}
     with warnings.catch_warnings():
         if integrals is not None:  # whoever made them has heard it
             warnings.simplefilter("ignore", MassRangeWarning)
@@ -319,11 +323,11 @@ class _Judge:
         own = population.law.multiplicity_fraction
         pair = np.minimum(1.0, population.scale(self.fraction)[0] * own)
         star, number = population.law.star, population.abundance
-        kept = np.bincount(star, number * (1.0 - pair * (1.0 - integrals.unresolved)))
+        alone = 1.0 if integrals.single_kept is None else integrals.single_kept
+        kept = np.bincount(star, number * (alone - pair * integrals.lost))
         relative = []
         for power in (1, 2):
-            x = pair * integrals.coefficient[0, :, power] * integrals.separation[0, :, power]
-            x = np.bincount(star, number * x)
+            x = np.bincount(star, number * pair * integrals.power(power, power))
             rest = x - kept * (x.sum() / kept.sum())
             relative.append(np.sqrt(rest @ rest) / x.sum() if x.sum() > 0 else 0.0)
         ratio = 1.0 + np.repeat([relative[0], 0.5 * relative[1]], [4, 3])
@@ -369,6 +373,8 @@ def _moved(
 
 def _rough(population: Population) -> PairIntegrals:
     """Integrals good enough for changes."""
+    if population.selection is not None:
+        return integrate(population, _INTERVALS)
     return PairIntegrals(
         cut=population.cut,
         coefficient=coefficient_moments(population, _INTERVALS),
@@ -380,6 +386,8 @@ def _again(population: Population, integrals: PairIntegrals, moved: str) -> Pair
     """Integrals of a population of which one figure has moved: only what depends on it is found anew."""
     if moved == "multiplicity_fraction":
         return integrals
+    if population.selection is not None:
+        return _rough(population)
     if moved == "mass_ratio_exponent":
         return replace(integrals, coefficient=coefficient_moments(population, _INTERVALS))
     return replace(integrals, cut=population.cut, separation=separation_moments(population))
@@ -409,8 +417,8 @@ def _choices(
         is_other = dict(zip(names, other, strict=True))
         chosen = replace(model, **{name: value for name, value in model.choices.items() if is_other[name]})
         light = other_photometry if other[0] else photometry
-        population = Population.of(stars, multiplicity=chosen, photometry=light, cut=models["cut"])
-        if is_other.get("projection"):  # the mass ratio knows nothing of it
+        population = Population.of(stars, **models | {"multiplicity": chosen, "photometry": light})
+        if is_other.get("projection") and population.selection is None:  # the mass ratio knows nothing of it
             same = tuple(flag and name != "projection" for name, flag in is_other.items())
             coefficient = out[same][1].coefficient
             integrals = PairIntegrals(
