@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["ShapeNoise", "influence", "shape_noise"]
+__all__ = ["ShapeNoise", "fitted_noise", "influence", "measured_noise"]
 
 STARS = 8
-"""Places in the pixel over which the variance is averaged (count)."""
+"""Places in the pixel over which variances are averaged (count)."""
 
 WEIGHT_SIGMAS = 5.0
 """Half width of a stamp in sigmas of a fixed weight: 1e-5 of the weight lies beyond (dimensionless)."""
@@ -31,74 +31,60 @@ WEIGHT_SIGMAS = 5.0
 STEP = 1e-4
 """Step of the differences that stand for derivatives, over the size (dimensionless)."""
 
+MAGNITUDES = np.linspace(12.0, 28.0, 65)
+"""Where variances are tabulated, in mag: the logarithm is good to 1e-3 between."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ShapeNoise:
-    r"""Standard deviation of the shape of a single star, the mean over its exposures.
+    """Standard deviation of the shape of a single star against magnitude, all exposures together.
 
     Parameters
     ----------
-    exposures : Exposures
-        Flux and noise.
-    estimator : str
-        Its name.
-    from_star, from_background : (3,) float array
-        Variances of e1, e2 and R²/R0² for one electron of star and of background: a and b in the formula,
-        dimensionless.
-
-    Notes
-    -----
-    :math:`\sigma^2 = (a / F + b B / F^2) / n` for n exposures of F electrons and the variance B of a pixel without a
-    star.  First order in the noise: for stars of which the flux is measured to 5 % or better.
+    name : str
+        What measures, and on what.
+    variance_e, variance_r2 : (n,) float array
+        At `MAGNITUDES`: mean of the variances of e1 and e2, and that of R²/R0², dimensionless.
     """
 
-    exposures: Exposures
-    estimator: str
-    from_star: FloatArray
-    from_background: FloatArray
+    name: str
+    variance_e: FloatArray
+    variance_r2: FloatArray
 
-    def _sigma(self, magnitude: FloatArray, which: slice, n_exposures: int | None) -> FloatArray:
-        flux = self.exposures.electrons(magnitude)
-        n = self.exposures.n_exposures if n_exposures is None else n_exposures
-        a, b = self.from_star[which].mean(), self.from_background[which].mean()
-        return np.asarray(np.sqrt((a / flux + b * self.exposures.background / flux**2) / n))
-
-    def sigma_e(self, magnitude: FloatArray, n_exposures: int | None = None) -> FloatArray:
+    def sigma_e(self, magnitude: FloatArray) -> FloatArray:
         """Standard deviation of one component of the ellipticity.
 
         Parameters
         ----------
         magnitude : (n,) float array
-            In mag.
-        n_exposures : int, optional
-            Of which the mean is taken (count); all where not given.
+            Of the star, in mag.
 
         Returns
         -------
         sigma_e : (n,) float array
-            Rms over e1 and e2, dimensionless.
+            Dimensionless.
         """
-        return self._sigma(magnitude, slice(0, 2), n_exposures)
+        return np.asarray(np.exp(0.5 * np.interp(magnitude, MAGNITUDES, np.log(self.variance_e))))
 
-    def sigma_r2(self, magnitude: FloatArray, n_exposures: int | None = None) -> FloatArray:
+    def sigma_r2(self, magnitude: FloatArray) -> FloatArray:
         """Standard deviation of R² over that of the PSF.
 
         Parameters
         ----------
         magnitude : (n,) float array
-            In mag.
-        n_exposures : int, optional
-            Of which the mean is taken (count); all where not given.
+            Of the star, in mag.
 
         Returns
         -------
         sigma_r2 : (n,) float array
             Dimensionless.
         """
-        return self._sigma(magnitude, slice(2, 3), n_exposures)
+        return np.asarray(np.exp(0.5 * np.interp(magnitude, MAGNITUDES, np.log(self.variance_r2))))
 
 
-def influence(image: FloatArray, pixel: float, estimator: Estimator) -> FloatArray:
+def influence(
+    image: FloatArray, pixel: float, estimator: Estimator, guess_sigma: float | None = None
+) -> FloatArray:
     r"""First-order change of a measured shape by a change of each pixel.
 
     Parameters
@@ -109,6 +95,8 @@ def influence(image: FloatArray, pixel: float, estimator: Estimator) -> FloatArr
         Side of a pixel, in arcsec.
     estimator : Estimator
         `Adaptive`, `GaussianWeight` or `Plain`.
+    guess_sigma : float, optional
+        Sigma from which adaptive weights start, in arcsec; see `measure_stamps`.
 
     Returns
     -------
@@ -127,7 +115,7 @@ def influence(image: FloatArray, pixel: float, estimator: Estimator) -> FloatArr
     term of the sum and A its derivative with respect to (centroid, Q), a change :math:`\delta I` of a pixel moves
     these by :math:`-A^{-1} \psi\, \delta I`.
     """
-    found = measure_stamps(image[None], pixel, estimator)
+    found = measure_stamps(image[None], pixel, estimator, guess_sigma)
     if found.shape.flag[0]:
         raise ValueError(f"image must be one that {estimator.name} measures, got flag {found.shape.flag[0]}")
     solution = np.array([found.x[0], found.y[0], *found.shape.covariance()[0]])
@@ -164,8 +152,8 @@ def _terms(image: FloatArray, pixel: float, estimator: Estimator, solution: Floa
     return np.stack([(weight * term).ravel() for term in terms])
 
 
-def shape_noise(psf: PSF, exposures: Exposures, estimator: Estimator) -> ShapeNoise:
-    """Standard deviation of the shape of single stars against magnitude.
+def measured_noise(psf: PSF, exposures: Exposures, estimator: Estimator) -> ShapeNoise:
+    r"""Noise of shapes that an estimator measures on the pixels of every exposure, their mean taken.
 
     Parameters
     ----------
@@ -174,12 +162,23 @@ def shape_noise(psf: PSF, exposures: Exposures, estimator: Estimator) -> ShapeNo
     exposures : Exposures
         Flux and noise.
     estimator : Estimator
-        Measures every exposure; the mean is taken.
+        On survey pixels: HSM's adaptive weight collapses on stars as undersampled as Euclid's and Roman's.
 
     Returns
     -------
     noise : ShapeNoise
         Averaged over the place of a star in its pixel.
+
+    Raises
+    ------
+    ValueError
+        If the estimator cannot measure a star on such pixels.
+
+    Notes
+    -----
+    With the influence :math:`\psi` of a pixel on the shape of a star P of unit flux and the variance B of a pixel
+    without a star, :math:`\sigma^2 = [\sum P \psi^2 / F + B \sum \psi^2 / F^2] / n` for n exposures of F electrons.
+    First order in the noise: for stars whose flux is measured to 5 % or better.
     """
     wide = WEIGHT_SIGMAS * estimator.sigma if isinstance(estimator, GaussianWeight) else estimator.reach
     star = pointings(psf, exposures.pixel, dither_pattern(1), half_width=max(HALF_WIDTH, wide))
@@ -187,9 +186,52 @@ def shape_noise(psf: PSF, exposures: Exposures, estimator: Estimator) -> ShapeNo
     for phase in range(STARS):
         here = replace(star, place=dither_pattern(1, phase))
         image = here.images(np.zeros(1), np.zeros(1)).reshape(star.side, star.side)
-        square = influence(image, exposures.pixel, estimator) ** 2
+        square = influence(image, exposures.pixel, estimator, psf.fwhm / 2) ** 2
         from_star += (square * np.maximum(image, 0.0)).sum(axis=(1, 2)) / STARS
         from_background += square.sum(axis=(1, 2)) / STARS
-    return ShapeNoise(
-        exposures=exposures, estimator=estimator.name, from_star=from_star, from_background=from_background
-    )
+    flux = exposures.electrons(MAGNITUDES)[:, None]
+    variance = (from_star / flux + from_background * exposures.background / flux**2) / exposures.n_exposures
+    return _noise(f"{estimator.name}, {exposures.name}", variance)
+
+
+def fitted_noise(psf: PSF, exposures: Exposures, r2: float) -> ShapeNoise:
+    r"""Noise of the best that can be done: a fit of the known PSF widened by three small second moments.
+
+    Parameters
+    ----------
+    psf : PSF
+        Effective: convolved with the pixel.
+    exposures : Exposures
+        Flux and noise; all are fitted at once.
+    r2 : float
+        R² by which the fitted moments are divided, in arcsec².
+
+    Returns
+    -------
+    noise : ShapeNoise
+        Averaged over the place of a star in its pixel.
+
+    Notes
+    -----
+    The model is :math:`F (P + x \cdot \nabla P + \frac12 q_{ij} \partial_i \partial_j P)`, its six parameters free;
+    the inverse of the Fisher matrix holds the variances of :math:`\delta R^2 = q_{xx} + q_{yy}`,
+    :math:`\delta e_1 R^2 = q_{xx} - q_{yy}` and :math:`\delta e_2 R^2 = 2 q_{xy}`, which are those of plain moments:
+    multiply with the response of an estimator for its change.  It is the noise behind the statistic of `Detection`.
+    """
+    to_shape = np.array([[1.0, 0.0, -1.0], [0.0, 2.0, 0.0], [1.0, 0.0, 1.0]]) / r2
+    half = np.array([1.0, 1.0, 1.0, 0.5, 1.0, 0.5])[:, None]  # xy and yx are one
+    star = pointings(psf, exposures.pixel, dither_pattern(exposures.n_exposures))
+    flux = exposures.electrons(MAGNITUDES)
+    variance = np.zeros((flux.size, 3))
+    for phase in range(STARS):
+        templates = replace(star, place=dither_pattern(exposures.n_exposures, phase)).derivatives() * half
+        for k, f in enumerate(flux.tolist()):
+            weight = f / (exposures.background / f + np.maximum(templates[0], 0.0))
+            covariance = np.linalg.inv((templates * weight) @ templates.T)[3:, 3:]
+            variance[k] += np.diag(to_shape @ covariance @ to_shape.T) / STARS
+    return _noise(f"fit, {exposures.name}", variance)
+
+
+def _noise(name: str, variance: FloatArray) -> ShapeNoise:
+    """Of variances (n, 3) of e1, e2 and R²/R0²."""
+    return ShapeNoise(name=name, variance_e=variance[:, :2].mean(axis=1), variance_r2=variance[:, 2])
