@@ -12,6 +12,7 @@ from scipy.ndimage import map_coordinates, spline_filter1d
 from scipy.stats import chi2, ncx2
 
 from porrima.pointings import Pointings, dither_pattern, pointings
+from porrima.units import SIGMA_PER_FWHM
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -118,6 +119,7 @@ def misfit(
     angle: FloatArray,
     magnitude: FloatArray,
     statistic: Statistic = "shape",
+    r2_error: float = 0.0,
 ) -> FloatArray:
     r"""Expected :math:`\Delta\chi^2` of the best fit by one star to pairs without noise.
 
@@ -133,6 +135,9 @@ def misfit(
         Of the whole system, in mag.
     statistic : {"shape", "residuals"}
         What is looked at.
+    r2_error : float
+        Rms error of the known PSF in R², and in R² e1 and R² e2, in arcsec²; it counts as noise of the shape, and is
+        not in the residuals.
 
     Returns
     -------
@@ -148,18 +153,21 @@ def misfit(
 
     .. math:: \lambda = F^2 |r|^2 \quad\text{or, for the shape,}\quad \lambda = F^2 |T^\mathsf{T} r|^2 ,
 
-    T being an orthonormal basis of what the three second derivatives add.  The noise of the pair is taken for that
+    T being an orthonormal basis of what the three second derivatives add; an error of the PSF adds to the unit
+    covariance of :math:`T^\mathsf{T} r`, by which its square is then divided.  The noise of the pair is taken for that
     of the star fitted to it.
     """
     templates, flux = star.derivatives(), exposures.electrons(magnitude)
     noise = exposures.background / flux
     residual = _residuals(star, templates, _basis(templates, float(np.median(noise))), separation, flux_ratio, angle)
     bases = [_basis(templates, level) for level in noise.tolist()]
-    parts = np.stack([(residual @ (q * root).T) ** 2 for root, q, _ in bases], axis=1)
+    parts = np.stack([residual @ (q * root).T for root, q, _ in bases], axis=1)
     if statistic == "shape":
-        return flux * parts[..., SHAPE_DEGREES:].sum(axis=-1)
+        for k, f in enumerate(flux.tolist()):
+            parts[:, k, 3:] = np.linalg.solve(_spread(bases[k][2], f, r2_error), parts[:, k, 3:].T).T
+        return flux * (parts[..., 3:] ** 2).sum(axis=-1)
     weight = np.stack([root**2 for root, _, _ in bases], axis=1)
-    return np.maximum(flux * (residual**2 @ weight - parts[..., :SHAPE_DEGREES].sum(axis=-1)), 0.0)
+    return np.maximum(flux * (residual**2 @ weight - (parts[..., :3] ** 2).sum(axis=-1)), 0.0)
 
 
 def _basis(templates: FloatArray, background: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -171,6 +179,16 @@ def _basis(templates: FloatArray, background: float) -> tuple[FloatArray, FloatA
     scale = np.linalg.norm(templates, axis=1)
     q, triangle = np.linalg.qr((templates * root / scale[:, None]).T)
     return root, q.T, triangle * scale
+
+
+def _spread(triangle: FloatArray, flux: float, r2_error: float) -> FloatArray:
+    """Cholesky factor (3, 3) of the covariance of the shape's three parts, noise and PSF error together.
+
+    Coefficients of the second derivatives are q_xx/2, q_xy and q_yy/2; equal errors of q_xx + q_yy, q_xx - q_yy and
+    2 q_xy give them these variances.
+    """
+    of_psf = math.sqrt(flux) * r2_error * triangle[3:, 3:] * np.sqrt([0.125, 0.25, 0.125])
+    return np.linalg.cholesky(np.eye(3) + of_psf @ of_psf.T)
 
 
 def _residuals(
@@ -239,6 +257,7 @@ class Detection:
         *,
         false_alarm: float = FALSE_ALARM,
         statistic: Statistic = "shape",
+        psf_error: float = 0.0,
         roll: FloatArray | None = None,
         magnitudes: tuple[int, int] = (14, 26),
     ) -> Detection:
@@ -254,6 +273,9 @@ class Detection:
             Share of single stars taken for pairs, in (0, 1).
         statistic : {"shape", "residuals"}
             What is looked at.
+        psf_error : float
+            Rms error of the known PSF in R² over R², and in e1 and e2, from star to star, dimensionless; R² is that of
+            a Gaussian of the same FWHM.
         roll : (n_exposures,) float array, optional
             Turn of the detector in each exposure, in rad; none where not given.
         magnitudes : (int, int)
@@ -268,11 +290,12 @@ class Detection:
         separation, contrast = np.meshgrid(10**_LOG_SEPARATION, _CONTRAST, indexing="ij")
         r, f = (np.tile(v.ravel(), ANGLES) for v in (separation, 10 ** (-0.4 * contrast)))
         angle = np.repeat(2 * math.pi * np.arange(ANGLES) / ANGLES, contrast.size)
+        r2_error = psf_error * 2 * (psf.fwhm * SIGMA_PER_FWHM) ** 2
         found, star = [], pointings(psf, exposures.pixel, dither_pattern(exposures.n_exposures), roll)
         for phase in range(PHASES):
             star = replace(star, place=dither_pattern(exposures.n_exposures, phase))
             turned = angle + 2 * math.pi * phase / PHASES / ANGLES
-            found.append(misfit(star, exposures, r, f, turned, grid, statistic))
+            found.append(misfit(star, exposures, r, f, turned, grid, statistic, r2_error))
         sorted_ = np.sort(np.reshape(found, (PHASES * ANGLES, -1)), axis=0)
         classes = sorted_.reshape(GROUPS, -1, *separation.shape, grid.size).mean(axis=1)
         trend = _trend(exposures, separation[..., None], 10 ** (-0.4 * contrast[..., None]), grid)
