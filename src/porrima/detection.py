@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from porrima.psf import PSF
 
     FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
 
 __all__ = ["FALSE_ALARM", "Detection", "Statistic", "detection_probability", "misfit", "threshold"]
 
@@ -99,7 +100,7 @@ def detection_probability(
     known variance, and for a fit that is linear over its noise.
     """
     grid, value = _probabilities(false_alarm, degrees)
-    return np.interp(np.sqrt(np.asarray(misfit, dtype=float)), grid, value)
+    return np.asarray(np.interp(np.sqrt(np.asarray(misfit, dtype=float)), grid, value))
 
 
 @lru_cache(maxsize=16)
@@ -159,15 +160,17 @@ def misfit(
     """
     templates, flux = star.derivatives(), exposures.electrons(magnitude)
     noise = exposures.background / flux
-    residual = _residuals(star, templates, _basis(templates, float(np.median(noise))), separation, flux_ratio, angle)
+    residual = _residuals(
+        star, templates, _basis(templates, float(np.median(noise))), separation, flux_ratio, angle
+    )
     bases = [_basis(templates, level) for level in noise.tolist()]
     parts = np.stack([residual @ (q * root).T for root, q, _ in bases], axis=1)
     if statistic == "shape":
         for k, f in enumerate(flux.tolist()):
             parts[:, k, 3:] = np.linalg.solve(_spread(bases[k][2], f, r2_error), parts[:, k, 3:].T).T
-        return flux * (parts[..., 3:] ** 2).sum(axis=-1)
+        return np.asarray(flux * (parts[..., 3:] ** 2).sum(axis=-1))
     weight = np.stack([root**2 for root, _, _ in bases], axis=1)
-    return np.maximum(flux * (residual**2 @ weight - (parts[..., :3] ** 2).sum(axis=-1)), 0.0)
+    return np.asarray(np.maximum(flux * (residual**2 @ weight - (parts[..., :3] ** 2).sum(axis=-1)), 0.0))
 
 
 def _basis(templates: FloatArray, background: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -188,7 +191,7 @@ def _spread(triangle: FloatArray, flux: float, r2_error: float) -> FloatArray:
     2 q_xy give them these variances.
     """
     of_psf = math.sqrt(flux) * r2_error * triangle[3:, 3:] * np.sqrt([0.125, 0.25, 0.125])
-    return np.linalg.cholesky(np.eye(3) + of_psf @ of_psf.T)
+    return np.asarray(np.linalg.cholesky(np.eye(3) + of_psf @ of_psf.T), dtype=float)
 
 
 def _residuals(
@@ -204,16 +207,17 @@ def _residuals(
     share = flux_ratio / (1 + flux_ratio)
     offset = separation * np.stack([np.cos(angle), np.sin(angle)])
 
-    def images(place: FloatArray, some: slice | FloatArray) -> FloatArray:
+    def images(place: FloatArray, some: IntArray) -> FloatArray:
         (x, y), (dx, dy), s = -place, offset[:, some], share[some, None]
-        return star.images(x, y) * (1 - s) + star.images(x + dx, y + dy) * s - templates[0]
+        pairs: FloatArray = star.images(x, y) * (1 - s) + star.images(x + dx, y + dy) * s - templates[0]
+        return pairs
 
     place = share * offset  # of the fitted star from the primary: first the flux centroid
-    wide = np.flatnonzero(separation > CLOSE)
+    wide = np.flatnonzero(np.asarray(separation) > CLOSE)
     for _ in range(FIT_STEPS - 1 if wide.size else 0):
         fit = np.linalg.solve(triangle[:3, :3], (images(place[:, wide], wide) @ (q[:3] * root).T).T)
         place[:, wide] += fit[1:] / (1 + fit[0])
-    return images(place, slice(None))
+    return images(place, np.arange(separation.size))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -324,7 +328,9 @@ class Detection:
         misfit : (GROUPS, n) float array
             Dimensionless; 0 for a single star.
         """
-        r, f, m = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (separation, flux_ratio, magnitude)))
+        r, f, m = np.broadcast_arrays(
+            *(np.asarray(v, dtype=float) for v in (separation, flux_ratio, magnitude))
+        )
         pair = (f > 0) & (r > 0)
         safe_r, safe_f = np.where(pair, r, WIDEST), np.where(pair, f, 1.0)
         step = _LOG_SEPARATION[1] - _LOG_SEPARATION[0]
@@ -359,7 +365,9 @@ class Detection:
         return np.asarray(detection_probability(found, self.false_alarm, self.degrees).mean(axis=0))
 
 
-def _trend(exposures: Exposures, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray) -> FloatArray:
+def _trend(
+    exposures: Exposures, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray
+) -> FloatArray:
     """What most of the misfit follows; see `Detection`."""
     y = flux_ratio / (1 + flux_ratio) ** 2
     square = separation**2 / (1 + (separation / _CORE) ** 2)

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 __all__ = ["detection_maps"]
 
 LEVELS = (0.1, 0.5, 0.9)
+"""Of the contours (probability)."""
+
+_RED = "#b00020"
 
 
 def detection_maps(maps: xr.Dataset) -> Figure:
@@ -37,24 +40,28 @@ def detection_maps(maps: xr.Dataset) -> Figure:
         axes = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
         for row, survey in zip(axes, maps["survey"].to_numpy(), strict=True):
             for axis, magnitude in zip(row, maps["magnitude"].to_numpy(), strict=True):
-                mesh = _map(axis, maps["probability"].sel(survey=survey, magnitude=magnitude), maps.attrs["cut"])
+                mesh = _map(
+                    axis, maps["probability"].sel(survey=survey, magnitude=magnitude), maps.attrs["cut"]
+                )
                 axis.set_title(f"{survey}, {magnitude:g} mag", fontsize=9)
             row[0].set_ylabel("contrast [mag]")
         for axis in axes[-1]:
             axis.set_xlabel("separation [arcsec]")
-        figure.colorbar(mesh, ax=axes, label="probability of detection", pad=0.01)
+        bar = figure.colorbar(mesh, ax=axes, label="probability of detection", pad=0.01)
+        for level in LEVELS:
+            bar.ax.axhline(level, color=_RED, linewidth=1.0)
     return figure
 
 
 def _map(axis: Any, probability: xr.DataArray, cut: float) -> Any:
     """One panel: shades, three contours, the cut."""
     place = probability["separation"], probability["contrast"]
-    mesh = axis.pcolormesh(*place, probability, vmin=0, vmax=1, cmap="Blues", shading="gouraud", rasterized=True)
-    lines = axis.contour(*place, probability, levels=LEVELS, colors="#b00020", linewidths=(0.7, 1.2, 0.7))
-    axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=6.5)
-    axis.axvline(cut, color="0.2", linestyle=":", linewidth=1.0)
+    mesh = axis.pcolormesh(
+        *place, probability, vmin=0, vmax=1, cmap="Blues", shading="gouraud", rasterized=True
+    )
+    axis.contour(*place, probability, levels=LEVELS, colors=_RED, linewidths=(0.7, 1.2, 0.7))
+    axis.axvline(cut, color="#e69f00", linestyle="--", linewidth=1.2)
     axis.set_xscale("log")
     axis.set_xticks([0.01, 0.02, 0.05, 0.1], ["0.01", "0.02", "0.05", "0.1"])
     axis.set_xticks([], minor=True)
-    axis.invert_yaxis()
     return mesh

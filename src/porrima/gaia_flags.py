@@ -61,7 +61,7 @@ def along_scan_error(magnitude: FloatArray) -> FloatArray:
 
     References
     ----------
-    Lindegren2021solution, Fig. A.1 as digitised in astromet.py
+    Lindegren2021b, Fig. A.1, as digitised in astromet.py
     """
     return np.asarray(1e-3 * np.exp(np.interp(magnitude, _G, np.log(_SIGMA_AL))))
 
@@ -71,10 +71,11 @@ def _line_spread() -> tuple[FloatArray, FloatArray]:
     """Grid in arcsec and line spread function of a long aperture behind samples, of sum 1."""
     x = np.arange(-1000, 1001) * _STEP
     arcsec = math.pi / 648_000
-    line = np.mean([np.sinc(x * arcsec * APERTURE / w) ** 2 / w for w in WAVELENGTHS], axis=0)
+    line: FloatArray = np.mean([np.sinc(x * arcsec * APERTURE / w) ** 2 / w for w in WAVELENGTHS], axis=0)
     edge = np.sqrt(2.0) * SMEAR
-    line = np.convolve(line, erf((x + SAMPLE / 2) / edge) - erf((x - SAMPLE / 2) / edge), mode="same")
-    return x, line / line.sum()
+    box = erf((x + SAMPLE / 2) / edge) - erf((x - SAMPLE / 2) / edge)
+    line = np.convolve(line, box, mode="same")
+    return np.asarray(x, dtype=np.float64), np.asarray(line / line.sum(), dtype=np.float64)
 
 
 @lru_cache(maxsize=1)
@@ -144,19 +145,19 @@ class GaiaFlags:
     Notes
     -----
     A model, not Gaia's pipeline.  A pair of fixed position angle lies along scan at :math:`r |\cos\psi|`.  Two lines
-    (diffraction by 1.45 m, samples of 59 mas) have two peaks from 0.09 arcsec on for equal stars, 0.14 arcsec at 2 mag and 0.19 at
-    4 mag, where the companion stands out of the noise of a window; a pair is flagged when one of `SCANS` independent scans
-    shows it, for 2 per cent of the windows are fewer than one scan.  A blended pair is placed by the fit of one line:
-    what the place on the sky leaves of that over the scan angles is the rms :math:`\delta`, and RUWE² =
-    :math:`1 + (\delta / \sigma_{AL})^2`.  Windows of two dimensions, the neighbours, the variable background and
-    what DR3 drops are left out.  Pairs wider than 0.6 arcsec are taken for such at 0.6.  Orbital motion is not in it,
-    for it depends on distance and period: see `orbital_excess`.  Astrometric ``non_single_star`` solutions were
-    tried for stars with ruwe > 1.4 only (Halbwachs et al. 2023), spectroscopic ones for stars brighter than 13 mag:
-    the flag adds nothing to ``ruwe`` here.
+    (diffraction by 1.45 m, samples of 59 mas) have two peaks from 0.09 arcsec on for equal stars, 0.14 arcsec at
+    2 mag and 0.19 arcsec at 4 mag, where the companion stands out of the noise of a window; a pair is flagged when
+    one of `SCANS` independent scans shows it, for 2 per cent of the windows are fewer than one scan.  A blended pair
+    is placed by the fit of one line: what one place on the sky leaves of that over the scan angles is the rms
+    :math:`\delta`, and RUWE² = :math:`1 + (\delta / \sigma_{AL})^2`.  Windows of two dimensions, neighbours, a
+    variable background and what DR3 drops are left out.  Pairs wider than 0.6 arcsec are treated as at 0.6 arcsec.
+    Orbital motion is not in it, for it depends on distance and period: see `orbital_excess`.  Astrometric
+    ``non_single_star`` solutions were tried for stars with ruwe > 1.4 only (Halbwachs et al. 2023), spectroscopic
+    ones for stars brighter than 13 mag: the flag adds nothing to ``ruwe`` here.
 
     References
     ----------
-    GaiaMission2016, Lindegren2021solution, Fabricius2021, Holl2023, Halbwachs2023
+    GaiaMission2016, Lindegren2021b, Fabricius2021, Holl2023, Halbwachs2023
     """
 
     multi_peak: bool = True
@@ -177,7 +178,9 @@ class GaiaFlags:
         rejected : (n,) float array
             In [0, 1], averaged over position angle.
         """
-        r, f, g = np.broadcast_arrays(separation, flux_ratio, np.asarray(magnitude, dtype=float) - self.colour)
+        r, f, g = np.broadcast_arrays(
+            separation, flux_ratio, np.asarray(magnitude, dtype=float) - self.colour
+        )
         share, rms = _scan_table()
         contrast = np.clip(-2.5 * np.log10(np.maximum(f, 1e-12)), 0.0, _CONTRAST[-1])
         place = np.stack([np.clip(r, 0.0, _SEPARATION[-1]), contrast], axis=-1)
@@ -185,7 +188,9 @@ class GaiaFlags:
         kept = np.full(r.shape, 1.0 - self.false_alarm)
         if self.multi_peak:
             seen = ndtr(f / (1 + f) * SAMPLE / error - PEAK_SIGNIFICANCE)
-            kept = kept * np.where(pair, (1 - np.clip(share(place).reshape(r.shape), 0, 1)) ** SCANS * seen + 1 - seen, 1.0)
+            kept = kept * np.where(
+                pair, (1 - np.clip(share(place).reshape(r.shape), 0, 1)) ** SCANS * seen + 1 - seen, 1.0
+            )
         ruwe2 = 1 + np.where(pair, (rms(place).reshape(r.shape) / error) ** 2, 0.0)
         return np.asarray(1 - kept * (ruwe2 <= self.ruwe_max**2))
 

@@ -122,7 +122,7 @@ def _draw(coefficients, column, row, out):  # type: ignore[no-untyped-def]
         for e in range(out.shape[1]):
             start_x = middle - n * (side // 2 + column[i, e])
             start_y = middle - n * (side // 2 + row[i, e])
-            jx, jy = int(math.floor(start_x)), int(math.floor(start_y))
+            jx, jy = math.floor(start_x), math.floor(start_y)
             _spline_weights(start_x - jx, wx)
             _spline_weights(start_y - jy, wy)
             stamp = out[i, e]

@@ -122,7 +122,8 @@ def influence(
     size = solution[2] + solution[4]
     steps = STEP * np.array([size**0.5, size**0.5, size, size, size])
     slopes = [
-        (_terms(image, pixel, estimator, solution + d) - _terms(image, pixel, estimator, solution - d)) @ image.ravel()
+        (_terms(image, pixel, estimator, solution + d) - _terms(image, pixel, estimator, solution - d))
+        @ image.ravel()
         for d in np.diag(steps)
     ]
     jacobian = np.array(slopes).T / (2 * steps)
@@ -137,7 +138,9 @@ def _terms(image: FloatArray, pixel: float, estimator: Estimator, solution: Floa
     """What each pixel is multiplied with in the five equations of an estimator, (5, n_pixel)."""
     ny, nx = image.shape
     x0, y0, q11, q12, q22 = solution
-    x, y = np.meshgrid((np.arange(nx) - (nx - 1) / 2) * pixel - x0, (np.arange(ny) - (ny - 1) / 2) * pixel - y0)
+    x, y = np.meshgrid(
+        (np.arange(nx) - (nx - 1) / 2) * pixel - x0, (np.arange(ny) - (ny - 1) / 2) * pixel - y0
+    )
     k = 1.0
     if isinstance(estimator, Adaptive):
         k = 0.5
