@@ -48,7 +48,10 @@ GAIA = (
 
 def survey_of(name, n_exposures):
     survey = SURVEYS[name]
-    psf = psf_from_name(survey.psf, pixel=survey.pixel, jitter=survey.jitter)
+    name_of_psf = survey.psf.replace(
+        "roman:", "roman-exact:"
+    )  # GalSim's own interpolation goes below 0 in the wings
+    psf = psf_from_name(name_of_psf, pixel=survey.pixel, jitter=survey.jitter)
     return psf, replace(EXPOSURES[name](), n_exposures=n_exposures)
 
 
