@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["gain"]
+__all__ = ["gain", "moved_together", "read_either_way", "with_figure_moved"]
 
-_FIGURES = {  # of a row of the table: what it is called in the law of companions
+FIGURES = {  # of a row of the table: what it is called in the law of companions
     "multiplicity_fraction": "multiplicity_fraction",
     "mass_ratio_exponent": "mass_ratio_exponent",
     "log_a": "log_a",
@@ -88,10 +88,10 @@ def gain(
     found = mean_x(start)
     value = np.log(found[0] / found)
     errors = []
-    for down_and_up in _moved(start, multiplicity):
+    for down_and_up in moved_together(start, multiplicity):
         x = np.array([mean_x(populations) for populations in down_and_up])
         errors.append(np.log(x[:, :1] / x) - value)
-    choices = np.array([mean_x(read(*choice)) for choice in _choices(multiplicity, photometry)])
+    choices = np.array([mean_x(read(*choice)) for choice in read_either_way(multiplicity, photometry)])
     envelope = np.log(choices[:, :1] / choices)
     change = np.array(errors)  # (source, 2, bin)
     low = envelope.min(axis=0) - np.sqrt(np.sum(np.minimum(change.min(axis=1), 0.0) ** 2, axis=0))
@@ -104,21 +104,68 @@ def gain(
     )
 
 
-def _moved(start: list[Population], model: DucheneKraus2013) -> Iterator[tuple[list[Population], ...]]:
-    """All bins with one figure of one row, or the cut, moved down and up by its error."""
-    width = 2.0 / 3.0 * model.scatter_scale  # of log a over that of log P
+def moved_together(
+    start: list[Population], model: DucheneKraus2013
+) -> Iterator[tuple[list[Population], list[Population]]]:
+    """All bins with one figure of one row, or the cut, moved by its error.
+
+    Parameters
+    ----------
+    start : list of Population
+        One for each bin.
+    model : DucheneKraus2013
+        Whose table it is.
+
+    Yields
+    ------
+    down, up : list of Population
+        The bins with the figure lowered and raised by one standard deviation.
+
+    Returns
+    -------
+    None
+        An iterator.
+    """
     for number, row in enumerate(ROW_ERRORS):
-        for figure, name in _FIGURES.items():
-            unit = width if figure == "sigma_log_period" else 1.0
-            ends = zip((-unit, unit), getattr(row, figure), strict=True)
-            yield tuple([_with(p, model, number, name, sign * error) for p in start] for sign, error in ends)
-    yield tuple([replace(p, cut=p.cut * (1 + sign * CUT_ERROR)) for p in start] for sign in (-1, 1))
+        for figure in FIGURES:
+            low, high = getattr(row, figure)
+            down, up = (
+                [with_figure_moved(p, model, number, figure, change) for p in start]
+                for change in (-low, high)
+            )
+            yield down, up
+    down, up = ([replace(p, cut=p.cut * (1 + sign * CUT_ERROR)) for p in start] for sign in (-1, 1))
+    yield down, up
 
 
-def _with(population: Population, model: DucheneKraus2013, row: int, name: str, change: float) -> Population:
-    """Population with one figure of the law of companions changed where its stars take a row."""
-    law = population.law
-    here = np.where(model.rows(population.stars.mass) == row, change, 0.0)
+def with_figure_moved(
+    population: Population, model: DucheneKraus2013, row: int, figure: str, change: float
+) -> Population:
+    """Population with one figure of the table changed where its stars take a row.
+
+    Parameters
+    ----------
+    population : Population
+        Of n stars.
+    model : DucheneKraus2013
+        Whose table it is.
+    row : int
+        As `DucheneKraus2013.rows` numbers them.
+    figure : str
+        A field of `uncertainty.RowErrors`.
+    change : float
+        Added to the figure, in its unit.
+
+    Returns
+    -------
+    population : Population
+        With another law of companions.
+    """
+    law, name = population.law, FIGURES[figure]
+    unit = (
+        2.0 / 3.0 * model.scatter_scale if figure == "sigma_log_period" else 1.0
+    )  # log a over that of log P
+    here = np.where(model.rows(population.stars.mass) == row, change * unit, 0.0)
     moved: Any = {name: getattr(law, name) + here}
     if name == "log_a":
         moved["log_a_max"] = law.log_a_max + here
@@ -127,10 +174,28 @@ def _with(population: Population, model: DucheneKraus2013, row: int, name: str, 
     return replace(population, law=replace(law, **moved))
 
 
-def _choices(
+def read_either_way(
     model: DucheneKraus2013, photometry: MassLuminosity
 ) -> Iterator[tuple[DucheneKraus2013, MassLuminosity]]:
-    """Models and relations in all combinations of what may be read either way, as given first."""
+    """Models and relations in all combinations of what may be read either way, as given first.
+
+    Parameters
+    ----------
+    model : DucheneKraus2013
+        As given.
+    photometry : MassLuminosity
+        As given.
+
+    Yields
+    ------
+    model, photometry : DucheneKraus2013, MassLuminosity
+        One of the combinations.
+
+    Returns
+    -------
+    None
+        An iterator.
+    """
     lights = [photometry, *(light for light in PHOTOMETRY.values() if light != photometry)]
     gaps = sorted(("lower", "solar"), key=lambda rule: rule != model.gap_rule)
     turned = sorted(("isotropic", "inclination-uniform"), key=lambda name: name != model.projection)
