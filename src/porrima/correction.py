@@ -14,7 +14,7 @@ import galsim
 import numpy as np
 
 from porrima.moments import INDICES
-from porrima.prediction import predict
+from porrima.prediction import QUANTITIES, predict
 from porrima.response import response
 from porrima.shear import ShearResponse, deconvolution_bias, moments_bias
 from porrima.uncertainty import NAMES
@@ -42,6 +42,7 @@ SHEAR = 0.02
 """Reduced shear, and relative stretch, of the PSFs between which the change is interpolated (dimensionless)."""
 
 _ROUNDS = 3  # until the change at the corrected shape is that which was taken off
+_SCATTER = [NAMES.index(f"sd_{quantity}") for quantity in QUANTITIES]
 _SECOND = [INDICES.index(powers) for powers in ((2, 0), (1, 1), (0, 2))]
 
 
@@ -209,8 +210,10 @@ class Correction:
         Kind of each source, as `uncertainty.Source` has it.
     choices : (2,) float array
         Lowest and highest residual by any combination of the choices of the models, over the bias, dimensionless.
+    growth : (3,) float array
+        Scatter of e1, e2 and R² averaged over the errors of the model, over that as predicted, dimensionless.
     covariance : (3, 3) float array
-        Of e1, e2 and R² [arcsec²] between stacks of so many stars: the scatter.
+        Of e1, e2 and R² [arcsec²] between stacks of so many stars, averaged over the errors of the model: the scatter.
     """
 
     patch: Patch
@@ -218,6 +221,7 @@ class Correction:
     sources: dict[str, tuple[float, float]]
     kinds: dict[str, str]
     choices: FloatArray
+    growth: FloatArray
     covariance: FloatArray
 
     @property
@@ -280,7 +284,7 @@ def correct(
     patch : Patch
         As measured.
     known : Uncertainty
-        Of the prediction for the stars of the patch.
+        Of the prediction for the stars of the patch and a finite number of stars.
     change : Change
         Of the same stars.
     prediction : Prediction, optional
@@ -305,15 +309,28 @@ def correct(
     errors = [sources[s.name] for s in known.sources if s.kind != "choice"]
     down, up = np.sqrt(np.sum(np.square(errors), axis=0))
     low, high = _sorted(*((end - known.value[k]) / own for end in known.interval("bias_r2")))
-    unit = np.array([1.0, 1.0, prediction.r2_0])
+    unit, growth = np.array([1.0, 1.0, prediction.r2_0]), _growth(known)
     return Correction(
         patch=patch,
         bias=patch.shape - change.taken_off(patch.shape),
         sources=sources,
         kinds={s.name: s.kind for s in known.sources},
         choices=np.array([min(low + down, 0.0), max(high - up, 0.0)]),
-        covariance=prediction.covariance[:, :, 0] * np.outer(unit, unit),
+        growth=growth,
+        covariance=prediction.covariance[:, :, 0] * np.outer(unit * growth, unit * growth),
     )
+
+
+def _growth(known: Uncertainty) -> FloatArray:
+    """Rms scatter of e1, e2 and R² over the errors of the model, to second order, over that as predicted, (3,)."""
+    own = known.value[_SCATTER]
+    own = np.where(own > 0, own, 1.0)
+    more = np.zeros(len(_SCATTER))
+    for source in known.sources:
+        if source.kind == "error":
+            ends = [1.0 + end[_SCATTER] / own for end in (source.low, source.high)]
+            more += 0.5 * (ends[0] ** 2 + ends[1] ** 2) - 1.0
+    return np.sqrt(1.0 + more)
 
 
 def _sorted(one: float, other: float) -> tuple[float, float]:
@@ -390,7 +407,7 @@ def residual_shear(
         bias=bias,
         model=np.sort(correction.model[:, None] * bias, axis=0),
         choices=np.sort(correction.choices[:, None] * bias, axis=0),
-        scatter=np.array([found.sd_m[0], found.sd_c1[0], found.sd_c2[0]]),
+        scatter=np.array([found.sd_m[0], found.sd_c1[0], found.sd_c2[0]]) * correction.growth[[2, 0, 1]],
         measurement=np.sqrt(np.diag(measured)),
     )
 

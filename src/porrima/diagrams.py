@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
 from matplotlib import colormaps, rc_context
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from porrima.instruments import Requirement
 
-__all__ = ["against_magnitude", "budget_shares"]
+__all__ = ["against_magnitude", "budget_shares", "corrections"]
 
 _RED = "#b00020"
 _TITLES = {"psf": "shape of the PSF", "fit": "shear, fit", "moments": "shear, moments"}
@@ -158,3 +159,63 @@ def _magnitude_legend(figure: Figure, axes: Any, data: xr.Dataset, requirement: 
     handles = [axes[0, 0].plot([], [], **look)[0] for look, _ in entries]
     labels = [label for _, label in entries]
     figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize=8.5)
+
+
+def corrections(answer: dict[str, Any]) -> Figure:
+    """Corrected shapes, patch by patch, or sizes of samples against what companions are to add to them.
+
+    Parameters
+    ----------
+    answer : dict
+        As `porrima correct --json` prints it, dimensionless and arcsec².
+
+    Returns
+    -------
+    figure : Figure
+        Ready to be written.
+    """
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        if "samples" in answer:
+            return _extrapolations(answer)
+        quantities = list(dict.fromkeys(row["quantity"] for row in answer["values"]))
+        figure = Figure(figsize=(7.4, 2.2 * len(quantities)), layout="constrained")
+        for axis, quantity in zip(
+            figure.subplots(len(quantities), 1, sharex=True, squeeze=False)[:, 0], quantities, strict=True
+        ):
+            rows = [row for row in answer["values"] if row["quantity"] == quantity]
+            number = range(1, len(rows) + 1)
+            corrected = [row["corrected"] for row in rows]
+            sides = [
+                [row["corrected"] - row["low"] for row in rows],
+                [row["high"] - row["corrected"] for row in rows],
+            ]
+            axis.plot(
+                number, [row["measured"] for row in rows], "o", color=COLOURS[1], mfc="none", label="measured"
+            )
+            axis.errorbar(
+                number, corrected, yerr=sides, fmt="s", color=COLOURS[0], markersize=4, label="corrected"
+            )
+            axis.set_ylabel(_LABELS[quantity] + (" [arcsec$^2$]" if quantity == "r2" else ""))
+        axis.set_xlabel("patch")
+        axis.xaxis.get_major_locator().set_params(integer=True)
+        axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _extrapolations(answer: dict[str, Any]) -> Figure:
+    """Size of each sample over the fitted one against the change that is predicted, with the fits."""
+    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    axis = figure.subplots()
+    for colour, fit in zip(itertools.cycle(COLOURS), answer["fits"], strict=False):
+        rows = [row for row in answer["samples"] if row["patch"] == fit["patch"]]
+        change = [row["predicted_change"] for row in rows]
+        line = [0.0, max(change)]
+        fitted = [fit["amplitude"] * x for x in line]
+        size = [fit["amplitude"] * x + row["residual"] for x, row in zip(change, rows, strict=True)]
+        axis.plot(line, fitted, color=colour, linewidth=1.2)
+        axis.plot(change, size, "o", color=colour, markersize=4, label=f"patch {fit['patch']}")
+        axis.errorbar([0.0], [0.0], yerr=[fit["error_r2"]], color=colour, capsize=3)
+    axis.set(xlabel=r"predicted $\delta R^2/R_0^2$", ylabel=r"$R^2/R_0^2 - 1$, $R_0^2$ as fitted")
+    if len(answer["fits"]) <= len(COLOURS):
+        axis.legend(frameon=False, fontsize=8)
+    return figure

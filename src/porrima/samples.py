@@ -5,16 +5,18 @@ An error of the model moves all samples at once, so it is found with each figure
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from porrima.averages import population_moments
+from porrima.distribution import pair_density
 from porrima.gain import moved_together, read_either_way
 from porrima.integrals import integrate
 from porrima.photometry import PHOTOMETRY
-from porrima.prediction import predict
+from porrima.prediction import MANY_STARS, predict
 from porrima.systems import Population
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["Fractions", "Samples", "samples_of"]
+__all__ = ["Clipped", "Fractions", "Samples", "clipped", "one_choice_made", "samples_of"]
 
 MOST_STARS = 500
 """Stars of a sample on which errors of the model are found, evenly through those given (count)."""
@@ -63,11 +65,11 @@ class Samples:
     moments : tuple of PopulationMoments
         Of one star of each.
     change : (k, 3) float array
-        Predicted mean change of e1, e2 (dimensionless) and R² [arcsec²].
+        Predicted mean change of e1, e2 (dimensionless) and R² [arcsec²], averaged over the errors of the model.
     per_star : (k, 3, 3) float array
-        Covariance of what one star adds to e1, e2 and R² [arcsec²]: N times that of stacks of N stars.
+        Covariance of what one star adds to e1, e2 and R² [arcsec²], N times that of stacks of N stars, likewise.
     model_error : (n, k, 3) float array
-        Change of the change by n errors of the model, one standard deviation or one choice made the other way each.
+        Change of the change by n errors of the model: one standard deviation each, or one choice the other way.
     """
 
     n_stars: NDArray[np.int64]
@@ -116,8 +118,10 @@ def samples_of(
 
     Notes
     -----
-    An error is half of the change between the figure moved down and up by its error, to first order symmetric.  The
-    errors of the binary fractions are independent, one for each sample.
+    A figure that is wrong by z standard deviations changes the change by a z + c z² (a: half of the difference between
+    the figure moved up and down; c: what is left of their mean): errors of a and of :math:`\sqrt2\,c`, and a mean of c,
+    which is added.  The scatter is averaged likewise.  The errors of the binary fractions are independent, one for each
+    sample.
 
     References
     ----------
@@ -127,40 +131,172 @@ def samples_of(
     whole = [Population.of(s, multiplicity=multiplicity, photometry=photometry, cut=cut) for s in stars]
     wanted = None if fractions is None else fractions.value
     moments = tuple(_moments(p, wanted, k) for k, p in enumerate(whole))
-    change, per_star = np.empty((len(whole), 3)), np.empty((len(whole), 3, 3))
-    unit = np.array([1.0, 1.0, float(response.shape0.r2)])
-    for k, (one, n) in enumerate(zip(moments, n_stars.tolist(), strict=True)):
-        found = predict(one, response, n)
-        change[k] = found.bias[:, 0] * unit
-        per_star[k] = found.covariance[:, :, 0] * np.outer(unit, unit) * n
     some = [s.take(np.arange(0, len(s), -(-len(s) // MOST_STARS))) for s in stars]
-
-    def changes(populations: Sequence[Population], at: FloatArray | None = wanted) -> FloatArray:
-        limits = [predict(_moments(p, at, k), response).bias[:, 0] for k, p in enumerate(populations)]
-        found: FloatArray = np.array(limits) * unit
-        return found
-
+    look = _Look(response=response, fractions=wanted)
     start = [Population.of(s, **models, cut=cut) for s in some]  # type: ignore[arg-type]
-    reference = changes(start)
-    errors = [0.5 * (changes(up) - changes(down)) for down, up in moved_together(start, multiplicity)]
+    reference = look.at(start)
+    errors, shift, more = [], np.zeros_like(reference.bias), np.zeros_like(reference.covariance)
+    for down, up in moved_together(start, multiplicity):
+        low, high = look.at(down), look.at(up)
+        curved = 0.5 * (high.bias + low.bias) - reference.bias
+        errors += [0.5 * (high.bias - low.bias), math.sqrt(2) * curved]
+        shift += curved
+        more += 0.5 * (high.covariance + low.covariance) - reference.covariance
     if choices:
-        for number, (model, light) in enumerate(read_either_way(multiplicity, photometry)):
-            if number in _ALONE:
-                other = [Population.of(s, multiplicity=model, photometry=light, cut=cut) for s in some]
-                errors.append(changes(other) - reference)
+        for model, light in one_choice_made(multiplicity, photometry):
+            other = [Population.of(s, multiplicity=model, photometry=light, cut=cut) for s in some]
+            errors.append(look.at(other).bias - reference.bias)
     if fractions is not None:
-        ends = [np.clip(fractions.value + sign * fractions.error, 0.0, 1.0) for sign in (-1.0, 1.0)]
-        apart = 0.5 * (changes(start, ends[1]) - changes(start, ends[0]))
-        errors += [np.where(np.arange(len(start))[:, None] == k, apart, 0.0) for k in range(len(start))]
+        errors += _errors_of_fractions(start, response, fractions)
+    unit = look.unit
+    found = [predict(one, response, n) for one, n in zip(moments, n_stars.tolist(), strict=True)]
+    scatter = np.array([f.covariance[:, :, 0] * (f.n_stars or 1) for f in found]) * np.outer(unit, unit)
     return Samples(
-        n_stars=n_stars, moments=moments, change=change, per_star=per_star, model_error=np.array(errors)
+        n_stars=n_stars,
+        moments=moments,
+        change=np.array([f.bias[:, 0] for f in found]) * unit + shift,
+        per_star=scatter + more,
+        model_error=np.array(errors),
     )
 
 
-_ALONE = (1, 2, 4)  # of the eight combinations: those with one choice made the other way
+class _Seen(NamedTuple):
+    """Mean change (k, 3) of long stacks of k samples, and covariance of what one star adds (k, 3, 3)."""
+
+    bias: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Look:
+    """What long stacks of populations show, in arcsec² and dimensionless."""
+
+    response: Response
+    fractions: FloatArray | None
+
+    @property
+    def unit(self) -> FloatArray:
+        """Of e1, e2 and R², (3,)."""
+        return np.array([1.0, 1.0, float(self.response.shape0.r2)])
+
+    def at(self, populations: Sequence[Population]) -> _Seen:
+        """What each sample shows."""
+        found = [
+            predict(_moments(p, self.fractions, k), self.response, MANY_STARS)
+            for k, p in enumerate(populations)
+        ]
+        covariance = np.array([f.covariance[:, :, 0] for f in found]) * MANY_STARS
+        return _Seen(
+            bias=np.array([f.bias[:, 0] for f in found]) * self.unit,
+            covariance=covariance * np.outer(self.unit, self.unit),
+        )
+
+
+def _errors_of_fractions(
+    populations: Sequence[Population], response: Response, fractions: Fractions
+) -> list[FloatArray]:
+    """Change of the mean change by the error of each sample's own binary fraction, (k, 3) each."""
+    low, high = (
+        _Look(
+            response=response,
+            fractions=np.clip(fractions.value + sign * fractions.error, 0.0, 1.0),
+        ).at(populations)
+        for sign in (-1.0, 1.0)
+    )
+    change, number = 0.5 * (high.bias - low.bias), np.arange(len(populations))[:, None]
+    return [np.where(number == k, change, 0.0) for k in range(len(populations))]
+
+
+def one_choice_made(
+    model: DucheneKraus2013, photometry: MassLuminosity
+) -> list[tuple[DucheneKraus2013, MassLuminosity]]:
+    """Models and relations with projection, gap rule or photometry, one of them, made the other way.
+
+    Parameters
+    ----------
+    model : DucheneKraus2013
+        As given.
+    photometry : MassLuminosity
+        As given.
+
+    Returns
+    -------
+    models : list of (DucheneKraus2013, MassLuminosity)
+        Three, in that order.
+    """
+    every = list(read_either_way(model, photometry))
+    return [every[1], every[2], every[4]]
 
 
 def _moments(population: Population, fractions: FloatArray | None, k: int) -> PopulationMoments:
     """Of one star of sample k."""
     fraction = None if fractions is None else fractions[k : k + 1]
     return population_moments(population, integrate(population), fraction)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Clipped:
+    r"""Stars that are left by thresholds on their own change of size, seen without noise.
+
+    Parameters
+    ----------
+    threshold : (k,) float array
+        Largest :math:`\delta R^2/R_0^2` of a star by itself, dimensionless.
+    removed : (k,) float array
+        Share of the stars that are rejected, in [0, 1].
+    eta : (k,) float array
+        Mean change of size of those that are left, over the size, dimensionless.
+    sd : (k,) float array
+        Standard deviation of what one of them adds, likewise.
+    """
+
+    threshold: FloatArray
+    removed: FloatArray
+    eta: FloatArray
+    sd: FloatArray
+
+
+def clipped(
+    population: Population,
+    response: Response,
+    threshold: FloatArray,
+    binary_fraction: float | None = None,
+) -> Clipped:
+    r"""Mean and scatter of the size change of stars below thresholds of their own, without noise.
+
+    Parameters
+    ----------
+    population : Population
+        Of stars of equal weight.
+    response : Response
+        Of the PSF and estimator.
+    threshold : (k,) float array
+        Largest :math:`\delta R^2/R_0^2` of a star by itself, dimensionless, positive; infinite for all.
+    binary_fraction : float, optional
+        Before pairs leave, in [0, 1]; None for the model's own.
+
+    Returns
+    -------
+    clipped : Clipped
+        Dimensionless.
+
+    Notes
+    -----
+    To first order, a pair changes the size by :math:`\kappa x/R_0^2`.  The pairs are counted on cells of flux ratio and
+    separation (`distribution.pair_density`), 6 % and 2 % wide, so that a threshold cuts x to some per cent.
+    """
+    density = pair_density(population, integrate(population), binary_fraction)
+    scale = response.kappa_r2 * population.cut**2 / (4 * float(response.shape0.r2))
+    added, share = scale * np.outer(density.four_y, density.square).ravel(), density.share.ravel()
+    order = np.argsort(added)
+    sums = np.cumsum(np.stack([share, share * added, share * added**2])[:, order], axis=1)
+    within = np.searchsorted(added[order], threshold, side="right") - 1
+    count, first, second = np.where(within >= 0, sums[:, np.maximum(within, 0)], 0.0)
+    kept = 1.0 - sums[0, -1] + count
+    mean = first / kept
+    return Clipped(
+        threshold=threshold,
+        removed=1.0 - kept,
+        eta=mean,
+        sd=np.sqrt(np.maximum(second / kept - mean**2, 0.0)),
+    )
