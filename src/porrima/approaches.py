@@ -73,7 +73,8 @@ def approaches(
     -----
     Clips are seen without noise, and their samples share their stars.
     """
-    (_, stars), options = bins[at], {"multiplicity": multiplicity}
+    _, stars = bins[at]
+    options: dict[str, Any] = {"multiplicity": multiplicity}
     known = uncertainty(stars, response, photometry=_LIGHT, n_stars=n_stars, **options)
     change = change_behind(known.prediction.population, [response], n_stars)
     one = correct(Patch(shape=change.shape0, n_stars=n_stars, error=np.zeros(3)), known, change)

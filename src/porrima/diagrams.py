@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from porrima.instruments import Requirement
 
-__all__ = ["against_magnitude", "budget_shares", "corrections"]
+__all__ = ["against_magnitude", "budget_shares", "correction_residuals", "corrections"]
 
 _RED = "#b00020"
 _TITLES = {"psf": "shape of the PSF", "fit": "shear, fit", "moments": "shear, moments"}
@@ -218,4 +218,55 @@ def _extrapolations(answer: dict[str, Any]) -> Figure:
     axis.set(xlabel=r"predicted $\delta R^2/R_0^2$", ylabel=r"$R^2/R_0^2 - 1$, $R_0^2$ as fitted")
     if len(answer["fits"]) <= len(COLOURS):
         axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def correction_residuals(data: xr.Dataset) -> Figure:
+    """Size and ellipticity of simulated stacks before and after a correction, against magnitude.
+
+    Parameters
+    ----------
+    data : Dataset
+        From `trials.trials`: dimensionless against mag.
+
+    Returns
+    -------
+    figure : Figure
+        Symbols are means over the trials with the range of two thirds of them; the band is the forecast of one standard
+        deviation about 0, the hatched one that of the extrapolation over all magnitudes.
+    """
+    middle = 0.5 * (data["mag_lo"] + data["mag_hi"])
+    edges = [*data["mag_lo"].to_numpy(), float(data["mag_hi"][-1])]
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(7.4, 3.4), layout="constrained")
+        labels = {"r2": r"$R^2/R_0^2 - 1$", "e1": r"$e_1 - e_{1,0}$"}
+        for axis, (quantity, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+            here = data.sel(quantity=quantity)
+            down, up = here["down"].mean("trial"), here["up"].mean("trial")
+            axis.stairs(
+                up, edges, baseline=-down, fill=True, color=COLOURS[0], alpha=0.18, label="forecast, after"
+            )
+            wide = float(here["extrapolated_error"].mean())
+            axis.axhspan(
+                -wide,
+                wide,
+                facecolor="none",
+                edgecolor="0.5",
+                hatch="////",
+                linewidth=0,
+                label="forecast, extrapolated",
+            )
+            for k, (name, marker) in enumerate((("before", "o"), ("after", "s"))):
+                values = here[name]
+                mean, ends = values.mean("trial"), values.quantile([1 / 6, 5 / 6], "trial")
+                sides = [mean - ends[0], ends[1] - mean]
+                axis.errorbar(
+                    middle + 0.12 * (2 * k - 1), mean, yerr=sides, color=COLOURS[1 - k], marker=marker,
+                    markersize=4, linestyle="none", linewidth=1.1, label=name,
+                )  # fmt: skip
+            axis.axhline(0.0, color="0.3", linewidth=0.6)
+            axis.set(xlabel="$i$ [mag]", ylabel=label)
+            axis.ticklabel_format(axis="y", style="sci", scilimits=(0, 0), useMathText=True)
+        axis.legend(frameon=False, fontsize=8)
+        figure.suptitle(f"{data.attrs['psf']}, stacks of {data.attrs['n_stars']} stars", fontsize=9.5)
     return figure
