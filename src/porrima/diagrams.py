@@ -265,8 +265,8 @@ def correction_residuals(data: xr.Dataset) -> Figure:
                     markersize=4, linestyle="none", linewidth=1.1, label=name,
                 )  # fmt: skip
             axis.axhline(0.0, color="0.3", linewidth=0.6)
-            axis.set(xlabel="$i$ [mag]", ylabel=label)
+            axis.set(xlim=(edges[0], edges[-1]), xlabel="$i$ [mag]", ylabel=label)
             axis.ticklabel_format(axis="y", style="sci", scilimits=(0, 0), useMathText=True)
-        axis.legend(frameon=False, fontsize=8)
+        figure.axes[0].legend(frameon=False, fontsize=8)
         figure.suptitle(f"{data.attrs['psf']}, stacks of {data.attrs['n_stars']} stars", fontsize=9.5)
     return figure

@@ -10,25 +10,11 @@ import typer
 from porrima.errors import InputError
 
 __all__ = [
-    "Band",
-    "Catalogue",
-    "EstimatorName",
-    "Format",
-    "Jitter",
-    "Json",
-    "Latitude",
-    "Longitude",
-    "Mag",
-    "Mapping",
-    "MultiplicityName",
-    "PhotometryName",
-    "Pixel",
-    "PixelScale",
-    "Psf",
-    "ReaderOptions",
-    "Seed",
-    "table_of",
-]
+    "Band", "BinaryFraction", "Catalogue", "EstimatorName", "Format", "GalaxySize", "GalaxySizes",
+    "Instrument", "Jitter", "Json", "Latitude", "Longitude", "Mag", "Mapping", "MultiplicityName", "Output",
+    "PhotometryName", "Pixel", "PixelScale", "Plot", "Psf", "ReaderOptions", "Seed", "StarsTable",
+    "SurveyCut", "SurveyPsf", "table_of",
+]  # fmt: skip
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
 Seed = Annotated[int, typer.Option("--seed", help="Of everything that is drawn.")]
@@ -62,6 +48,20 @@ Jitter = Annotated[
 EstimatorName = Annotated[
     str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")
 ]
+Instrument = Annotated[str | None, typer.Option(help="euclid-vis, roman-h158, rubin, kcm16 or massey13.")]
+StarsTable = Annotated[Path | None, typer.Option("--stars", help="Table as `porrima stars` writes it.")]
+SurveyPsf = Annotated[str | None, typer.Option("--psf", help="Name of the PSF; the instrument's.")]
+BinaryFraction = Annotated[float | None, typer.Option(help="0 to 1; as the model gives it if not given.")]
+GalaxySize = Annotated[
+    float | None, typer.Option(help="Half-light radius of exponential galaxies [arcsec]; 0.3.")
+]
+GalaxySizes = Annotated[
+    str | None,
+    typer.Option("--galaxies", help="Table, or {half_light_radius: R, scatter: S, index: N, ...}."),
+]
+SurveyCut = Annotated[float | None, typer.Option("--cut", help="Separation of resolved pairs [arcsec].")]
+Plot = Annotated[Path | None, typer.Option(help="Picture to write: PNG, PDF or SVG.")]
+Output = Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")]
 
 
 def table_of(stars: Path | None, catalog: Path | None, format: str | None) -> tuple[Path | None, str | None]:  # noqa: A002

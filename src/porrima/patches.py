@@ -110,13 +110,19 @@ class PatchTable:
 _SHAPE = ("e1", "e2", "r2")
 
 
-def one_patch(options: dict[str, float | None]) -> PatchTable:
+def one_patch(
+    shape: tuple[float, float, float] | None,
+    shape_error: tuple[float, float, float] | None,
+    n_stars: int | None,
+) -> PatchTable:
     """The PSF of one patch from options of the command.
 
     Parameters
     ----------
-    options : dict
-        Values by the names of `COLUMNS`, in their units; None where not given.
+    shape, shape_error : (float, float, float) or None
+        e1, e2 (dimensionless) and R² in arcsec², and their standard errors.
+    n_stars : int or None
+        Stars in the stack (count).
 
     Returns
     -------
@@ -128,18 +134,18 @@ def one_patch(options: dict[str, float | None]) -> PatchTable:
     InputError
         If one is missing or breaks its rule: names the option.
     """
-    given = {name: np.array([float(value)]) for name, value in options.items() if value is not None}
-    for name in (*_SHAPE, "n_stars"):
-        if name not in given:
-            raise InputError("is missing, or a table of patches", key=_option(name))
-    for name, rule, good in _rules(given):
+    for key, required in (("--shape", shape), ("--n-stars", n_stars)):
+        if required is None:
+            raise InputError("is missing, or a table of patches", key=key)
+    given = dict(zip(_SHAPE, shape or (), strict=False)) | {"n_stars": n_stars}
+    given |= {f"{name}_error": value for name, value in zip(_SHAPE, shape_error or (), strict=False)}
+    values = {name: np.array([value], dtype=float) for name, value in given.items()}
+    for name, rule, good in _rules(values):
         if not good.all():
-            raise InputError(rule, key=_option(name), value=f"{given[name][0]:g}")
-    return PatchTable(source=None, row=np.array([1]), name=("1",), named=False, values=given)
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
+            option = "--n-stars" if name == "n_stars" else "--shape-error" if "_" in name else "--shape"
+            key = option if name == "n_stars" else f"{option}, {name.removesuffix('_error')}"
+            raise InputError(rule, key=key, value=f"{values[name][0]:g}")
+    return PatchTable(source=None, row=np.array([1]), name=("1",), named=False, values=values)
 
 
 def read_patches(path: Path) -> PatchTable:

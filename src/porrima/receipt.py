@@ -85,8 +85,9 @@ def correct_header(answer: dict[str, Any]) -> str:
     header : str
         What was done with what; the fits, where samples of stars were fitted; dimensionless.
     """
+    config = answer["configuration"]
     with_model = (
-        "" if answer["multiplicity"] is None else f", {answer['multiplicity']}, cut {answer['cut']:g} arcsec"
+        "" if config is None else f", {config['multiplicity']['model']}, cut {answer['cut']:g} arcsec"
     )
     lines = [f"{answer['method']}: {answer['psf']}, {answer['estimator']}{with_model}"]
     for fit in answer.get("fits", [])[:MOST_LINES]:

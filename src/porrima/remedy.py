@@ -17,7 +17,7 @@ from porrima.deconvolution import fit_response
 from porrima.errors import InputError
 from porrima.extrapolation import best_split, extrapolate, sample_covariance
 from porrima.patches import one_patch, read_patches
-from porrima.prediction import QUANTITIES, predict
+from porrima.prediction import QUANTITIES, SeriesWarning, predict
 from porrima.sample import catalog_of, draw_stars
 from porrima.samples import Fractions, samples_of
 from porrima.shapes import estimator_from_name
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from porrima.galaxies import Galaxies
     from porrima.instruments import Requirement
     from porrima.patches import PatchTable
-    from porrima.prediction import Prediction
+    from porrima.prediction import PopulationMoments, Prediction
     from porrima.response import Response
     from porrima.samples import Samples
     from porrima.shear import ShearResponse
@@ -141,7 +141,9 @@ class _Scene:
 def corrected(
     *,
     table: Path | None,
-    measured: dict[str, float | None],
+    shape: tuple[float, float, float] | None,
+    shape_error: tuple[float, float, float] | None,
+    n_stars: int | None,
     method: str,
     nested: bool,
     instrument: str | None,
@@ -163,8 +165,8 @@ def corrected(
     ----------
     table : Path or None
         Of patches, or of samples of stars.
-    measured : dict
-        The PSF of one patch instead, by the names of `patches.COLUMNS`, in their units.
+    shape, shape_error, n_stars
+        The PSF of one patch instead, as `patches.one_patch` takes it, R² in arcsec².
     method : str
         One of `METHODS`.
     nested : bool
@@ -194,16 +196,14 @@ def corrected(
     """
     if method not in METHODS:
         raise InputError(f"must be one of {', '.join(METHODS)}", key="--method", value=method)
-    given = [name for name, value in measured.items() if value is not None]
-    if table is not None and given:
-        raise InputError(
-            "cannot be given together with a table of patches", key=f"--{given[0].replace('_', '-')}"
-        )
+    for key, value in (("--shape", shape), ("--shape-error", shape_error), ("--n-stars", n_stars)):
+        if table is not None and value is not None:
+            raise InputError("cannot be given together with a table of patches", key=key)
     if instrument is None and psf is None:
         raise InputError("is missing, or --instrument", key="--psf")
     if binary_fraction is not None and not 0 <= binary_fraction <= 1:
         raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
-    patches = one_patch(measured) if table is None else read_patches(table)
+    patches = one_patch(shape, shape_error, n_stars) if table is None else read_patches(table)
     survey, requirement = survey_of(instrument or "kcm16", None)
     sizes, shapes = galaxies_of(galaxy_size, galaxies), estimator_from_name(estimator)
     profile = profile_of(survey, psf, pixel, pixel_scale, jitter)
@@ -259,7 +259,9 @@ def _check_likeness(scene: _Scene) -> None:
         )
         where: dict[str, Any] = {"source": patches.source, "row": int(patches.row[k]), "column": "r2"}
         raise InputError(
-            rule, value=f"{patches.values['r2'][k]:g}", **(where if patches.source else {"key": "--r2"})
+            rule,
+            value=f"{patches.values['r2'][k]:g}",
+            **(where if patches.source else {"key": "--shape, r2"}),
         )
     if apart[k] > math.log(UNLIKE):
         text = f"a measured R² is {math.exp(apart[k]):.2f} times larger or smaller than that of the PSF given"
@@ -284,24 +286,16 @@ def _by_prediction(scene: _Scene) -> dict[str, Any]:
         place = (*scene.stars.place(k), fraction)
         if place not in known:
             stars = scene.stars.of(k)
-            known[place] = (
-                len(known) + 1,
-                uncertainty(
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", SeriesWarning)  # said below
+                found = uncertainty(
                     stars, scene.reply, binary_fraction=fraction, n_stars=patch.n_stars, **scene.models
-                ),
-            )
+                )
+            known[place] = len(known) + 1, found
             _add_population(out, *known[place], len(stars), place)
         number, one = known[place]
         if (place, patch.n_stars) not in changes:
-            moments = one.prediction.population
-            found = predict(moments, scene.reply, patch.n_stars)
-            if np.any(np.isnan(found.bias)):
-                rule = (
-                    "is too wide for the kernel moments of this PSF, whose expansion stops being good at order "
-                    f"{found.last_order[0]}: use --estimator plain"
-                )
-                raise InputError(rule, key="--cut", value=moments.cut)
-            changes[place, patch.n_stars] = change_behind(moments, scene.responses, patch.n_stars), found
+            changes[place, patch.n_stars] = _change(scene, one.prediction.population, patch.n_stars)
         change, prediction = changes[place, patch.n_stars]
         correction = correct(patch, one, change, prediction)
         first = _row_of(scene.patches, k) | {"n_stars": patch.n_stars, "population": number}
@@ -317,6 +311,26 @@ def _by_prediction(scene: _Scene) -> dict[str, Any]:
                 row |= {"measurement_error": left.measurement[j]}
                 out["shear"].append(_plain(row | _required(scene, quantity, left.bias[j], error[j])))
     return out
+
+
+def _change(scene: _Scene, moments: PopulationMoments, n_stars: int) -> tuple[Change, Prediction]:
+    """Change behind PSFs like the one given, and the prediction for that one; stops where pairs are too wide."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", SeriesWarning)
+        found = predict(moments, scene.reply, n_stars)
+    _refuse_wide(found.bias, moments.cut)
+    for warning in said:
+        warnings.warn(warning.message, stacklevel=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SeriesWarning)
+        return change_behind(moments, scene.responses, n_stars), found
+
+
+def _refuse_wide(change: FloatArray, cut: float) -> None:
+    """Stop where the series in kernel moments has not converged."""
+    if np.any(np.isnan(change)):
+        rule = "is too wide for the kernel moments of this PSF: use --estimator plain"
+        raise InputError(rule, key="--cut", value=cut)
 
 
 def _rms(ends: FloatArray) -> float:
@@ -458,9 +472,11 @@ def _sampled(
     if all(value is not None for value in fractions):
         known = Fractions(value=np.array(fractions, dtype=float), error=errors)
     n_stars = np.array([patches.patch(k).n_stars for k in rows])
-    found: Samples = samples_of(
-        [scene.stars.of(k) for k in rows], scene.reply, n_stars, fractions=known, **scene.models
-    )
+    stars = [scene.stars.of(k) for k in rows]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SeriesWarning)  # an error below
+        found: Samples = samples_of(stars, scene.reply, n_stars, fractions=known, **scene.models)
+    _refuse_wide(found.change, scene.models["cut"])
     if "e1" in patches.values:
         return measured, found.change, found.per_star, found.model_error, list(range(len(QUANTITIES)))
     return measured[:, 2:], found.change[:, 2:], found.per_star[:, 2:, 2:], found.model_error[:, :, 2:], size

@@ -9,9 +9,13 @@ import typer
 
 from porrima.options import (
     Band,
+    BinaryFraction,
     Catalogue,
     EstimatorName,
     Format,
+    GalaxySize,
+    GalaxySizes,
+    Instrument,
     Jitter,
     Json,
     Latitude,
@@ -19,11 +23,16 @@ from porrima.options import (
     Mag,
     Mapping,
     MultiplicityName,
+    Output,
     PhotometryName,
     Pixel,
     PixelScale,
+    Plot,
     ReaderOptions,
     Seed,
+    StarsTable,
+    SurveyCut,
+    SurveyPsf,
     table_of,
 )  # fmt: skip
 from porrima.terminal import show
@@ -33,11 +42,9 @@ __all__ = ["budget", "correct"]
 
 def budget(
     *,
-    instrument: Annotated[
-        str | None, typer.Option(help="euclid-vis, roman-h158, rubin, kcm16 or massey13.")
-    ] = None,
+    instrument: Instrument = None,
     requirements: Annotated[Path | None, typer.Option(help="YAML file: sigma_e, sigma_r2, m, c.")] = None,
-    stars: Annotated[Path | None, typer.Option("--stars", help="Table as `porrima stars` writes it.")] = None,
+    stars: StarsTable = None,
     catalog: Catalogue = None,
     format: Format = None,  # noqa: A002
     map: Mapping = None,  # noqa: A002
@@ -47,28 +54,22 @@ def budget(
     mag: Mag = (16.0, 24.0),
     bins: Annotated[int | None, typer.Option(help="Equal bins of magnitude.")] = None,
     step: Annotated[float | None, typer.Option(help="Width of a bin [mag]; 1 if not given.")] = None,
-    psf: Annotated[str | None, typer.Option("--psf", help="Name of the PSF; the instrument's.")] = None,
+    psf: SurveyPsf = None,
     pixel: Pixel = None,
     pixel_scale: PixelScale = None,
     jitter: Jitter = None,
     estimator: EstimatorName = "adaptive",
     n_stars: Annotated[int, typer.Option(help="From which the PSF of a patch is made.")] = 2000,
-    binary_fraction: Annotated[
-        float | None, typer.Option(help="0 to 1; as the model gives it if not given.")
-    ] = None,
-    galaxy_size: Annotated[
-        float | None, typer.Option(help="Half-light radius of exponential galaxies [arcsec]; 0.3.")
-    ] = None,
-    galaxies: Annotated[
-        str | None, typer.Option(help="Table, or {half_light_radius: R, scatter: S, index: N, ...}.")
-    ] = None,
+    binary_fraction: BinaryFraction = None,
+    galaxy_size: GalaxySize = None,
+    galaxies: GalaxySizes = None,
     multiplicity: MultiplicityName = "dk13",
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
-    cut: Annotated[float | None, typer.Option(help="Separation of resolved pairs [arcsec].")] = None,
+    cut: SurveyCut = None,
     seed: Seed = 1,
-    plot: Annotated[Path | None, typer.Option(help="Picture to write: PNG, PDF or SVG.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")] = None,
+    plot: Plot = None,
+    output: Output = None,
     as_json: Json = False,
 ) -> None:
     """Share of a survey's requirements that unresolved binaries use, by magnitude."""
@@ -86,63 +87,59 @@ def budget(
     show(result, as_json, header_of(result, multiplicity), BUDGET_COLUMNS, budget_lines(found))
 
 
+Patches = Annotated[
+    Path | None,
+    typer.Argument(help="Columns e1, e2, r2 [arcsec²], n_stars and more; or give one PSF by options."),
+]
+Method = Annotated[
+    str, typer.Option(help="predict; extrapolate (samples of stars); fields (low and high binary fraction).")
+]
+Measured = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(help="Measured, of one patch; R2 in arcsec².", metavar="E1 E2 R2"),
+]
+MeasuredError = Annotated[
+    tuple[float, float, float] | None, typer.Option(help="Standard errors.", metavar="E1 E2 R2")
+]
+MagOfAll = Annotated[
+    tuple[float, float] | None,
+    typer.Option("--mag", help="Of the stars, where the table does not say.", metavar="LO HI"),
+]
+Nested = Annotated[bool, typer.Option("--nested", help="Each sample of stars is part of all larger ones.")]
+
+
 def correct(
-    table: Annotated[
-        Path | None,
-        typer.Argument(help="Columns e1, e2, r2 [arcsec²], n_stars and more; or give one PSF by options."),
-    ] = None,
+    table: Patches = None,
     *,
-    method: Annotated[
-        str,
-        typer.Option(help="predict; extrapolate (samples of stars); fields (low and high binary fraction)."),
-    ] = "predict",
-    e1: Annotated[float | None, typer.Option("--e1", help="Measured, of the PSF of one patch.")] = None,
-    e2: Annotated[float | None, typer.Option("--e2", help="Measured, of the PSF of one patch.")] = None,
-    r2: Annotated[float | None, typer.Option("--r2", help="Measured [arcsec²].")] = None,
-    e1_error: Annotated[float | None, typer.Option("--e1-error", help="Standard error of e1.")] = None,
-    e2_error: Annotated[float | None, typer.Option("--e2-error", help="Standard error of e2.")] = None,
-    r2_error: Annotated[
-        float | None, typer.Option("--r2-error", help="Standard error of r2 [arcsec²].")
-    ] = None,
+    method: Method = "predict",
+    shape: Measured = None,
+    shape_error: MeasuredError = None,
     n_stars: Annotated[int | None, typer.Option(help="From which that PSF is made.")] = None,
-    nested: Annotated[
-        bool, typer.Option("--nested", help="Each sample of stars is part of all larger ones.")
-    ] = False,
-    instrument: Annotated[
-        str | None, typer.Option(help="euclid-vis, roman-h158, rubin, kcm16 or massey13.")
-    ] = None,
-    stars: Annotated[Path | None, typer.Option("--stars", help="Table as `porrima stars` writes it.")] = None,
+    nested: Nested = False,
+    instrument: Instrument = None,
+    stars: StarsTable = None,
     catalog: Catalogue = None,
     format: Format = None,  # noqa: A002
     map: Mapping = None,  # noqa: A002
     options: ReaderOptions = None,
     l: Longitude = None,
     b: Latitude = None,
-    mag: Annotated[
-        tuple[float, float] | None,
-        typer.Option("--mag", help="Of the stars, where the table does not say.", metavar="LO HI"),
-    ] = None,
-    psf: Annotated[str | None, typer.Option("--psf", help="Name of the PSF; the instrument's.")] = None,
+    mag: MagOfAll = None,
+    psf: SurveyPsf = None,
     pixel: Pixel = None,
     pixel_scale: PixelScale = None,
     jitter: Jitter = None,
     estimator: EstimatorName = "adaptive",
-    binary_fraction: Annotated[
-        float | None, typer.Option(help="0 to 1; as the model gives it if not given.")
-    ] = None,
-    galaxy_size: Annotated[
-        float | None, typer.Option(help="Half-light radius of exponential galaxies [arcsec]; 0.3.")
-    ] = None,
-    galaxies: Annotated[
-        str | None, typer.Option(help="Table, or {half_light_radius: R, scatter: S, index: N, ...}.")
-    ] = None,
+    binary_fraction: BinaryFraction = None,
+    galaxy_size: GalaxySize = None,
+    galaxies: GalaxySizes = None,
     multiplicity: MultiplicityName = "dk13",
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
-    cut: Annotated[float | None, typer.Option(help="Separation of resolved pairs [arcsec].")] = None,
+    cut: SurveyCut = None,
     seed: Seed = 1,
-    plot: Annotated[Path | None, typer.Option(help="Picture to write: PNG, PDF or SVG.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")] = None,
+    plot: Plot = None,
+    output: Output = None,
     as_json: Json = False,
 ) -> None:
     """A measured PSF with the bias of unresolved binaries taken off, and what is left."""
@@ -150,19 +147,11 @@ def correct(
     from porrima.remedy import corrected
 
     catalog, format = table_of(stars, catalog, format)  # noqa: A001
-    measured = {
-        "e1": e1,
-        "e2": e2,
-        "r2": r2,
-        "e1_error": e1_error,
-        "e2_error": e2_error,
-        "r2_error": r2_error,
-    }
     result = corrected(
-        table=table, measured=measured | {"n_stars": n_stars}, method=method, nested=nested, instrument=instrument,
-        galaxy_size=galaxy_size, galaxies=galaxies, mag=mag, psf=psf, pixel=pixel, pixel_scale=pixel_scale,
-        jitter=jitter, estimator=estimator, binary_fraction=binary_fraction, cut=cut, l=l, b=b, catalog=catalog,
-        format=format, map=map, options=options, band=band, seed=seed, multiplicity=multiplicity,
+        table=table, shape=shape, shape_error=shape_error, n_stars=n_stars, method=method, nested=nested,
+        instrument=instrument, galaxy_size=galaxy_size, galaxies=galaxies, mag=mag, psf=psf, pixel=pixel,
+        pixel_scale=pixel_scale, jitter=jitter, estimator=estimator, binary_fraction=binary_fraction, cut=cut, l=l, b=b,
+        catalog=catalog, format=format, map=map, options=options, band=band, seed=seed, multiplicity=multiplicity,
         photometry=photometry,
     )  # fmt: skip
     write_correction(result, output, plot)

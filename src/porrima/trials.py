@@ -12,6 +12,7 @@ from porrima.extrapolation import extrapolate, sample_covariance
 from porrima.gain import with_figure_moved
 from porrima.images import measure_stack
 from porrima.photometry import PHOTOMETRY
+from porrima.prediction import QUANTITIES
 from porrima.response import response
 from porrima.samples import samples_of
 from porrima.stack import draw_stacks, draw_systems
@@ -147,16 +148,17 @@ def trials(
     """
     import xarray as xr  # noqa: PLC0415  (slow to import, needed for results only)
 
-    reply, rng = response(psf, estimator), np.random.Generator(np.random.Philox(seed))
-    start = [Population.of(s, multiplicity=multiplicity, photometry=_LIGHT, cut=cut) for _, s in bins]
+    reply = response(psf, estimator)
     true = _array(reply.shape0 if method == "moments" else estimator.measure(psf.draw()))
     unit = np.array([1.0, 1.0, true[2]])
+    start = [Population.of(s, multiplicity=multiplicity, photometry=_LIGHT, cut=cut) for _, s in bins]
     measured = np.empty((n_trials, len(bins), 3))
+    rng = np.random.Generator(np.random.Philox(seed))
     for trial in range(n_trials):
         wrong = draw_wrong(rng)
         for k, population in enumerate(start):
-            drawn = wrong.applied(population, multiplicity)
             run = {"n_stars": n_stars, "seed": seed, "stack": trial * len(bins) + k}
+            drawn = wrong.applied(population, multiplicity)
             measured[trial, k] = _stack(drawn, psf, reply, estimator, run, method)
         if progress is not None:
             progress(1)
@@ -176,22 +178,18 @@ def trials(
     spread = sample_covariance(samples.per_star, samples.n_stars)
     fits = [extrapolate(y, samples.change, spread, samples.model_error) for y in measured]
     edges = np.array([magnitude for magnitude, _ in bins])
-    cube = ("trial", "bin", "quantity")
+    attrs = {"n_stars": n_stars, "psf": psf.name, "method": method, "seed": seed, "cut": cut}
+    cubes = {"before": measured - true, "after": found.pop("after") - true} | found
+    each = ("trial", "quantity")
     return xr.Dataset(
-        {
-            "before": (cube, (measured - true) / unit),
-            "after": (cube, (found.pop("after") - true) / unit),
-            "extrapolated": (("trial", "quantity"), (np.array([f.shape for f in fits]) - true) / unit),
-            "extrapolated_error": (("trial", "quantity"), np.array([f.error for f in fits]) / unit),
+        {name: (("trial", "bin", "quantity"), values / unit) for name, values in cubes.items()}
+        | {
+            "extrapolated": (each, (np.array([f.shape for f in fits]) - true) / unit),
+            "extrapolated_error": (each, np.array([f.error for f in fits]) / unit),
             "amplitude": ("trial", np.array([f.amplitude for f in fits])),
-        }
-        | {name: (cube, values / unit) for name, values in found.items()},
-        coords={
-            "mag_lo": ("bin", edges[:, 0]),
-            "mag_hi": ("bin", edges[:, 1]),
-            "quantity": ["e1", "e2", "r2"],
         },
-        attrs={"n_stars": n_stars, "psf": psf.name, "method": method, "seed": seed, "cut": cut},
+        coords={"mag_lo": ("bin", edges[:, 0]), "mag_hi": ("bin", edges[:, 1]), "quantity": list(QUANTITIES)},
+        attrs=attrs,
     )
 
 
