@@ -113,6 +113,7 @@ def test_clipped_samples_that_share_stars_have_the_covariance_and_the_fit_its_fo
     )
     assert means.mean(axis=1) == pytest.approx(law.eta, rel=0.02)  # cells of the law cut x to some per cent
     drawn = np.array([added[k].mean() for k in kept]), np.array([added[k].var() for k in kept])
+    assert np.sqrt(drawn[1]) == pytest.approx(law.sd, rel=0.03)
     n = np.round(n_stars * share).astype(int)
     closed = sample_covariance(drawn[1][:, None, None], n, nested=True)
     moved = means - means.mean(axis=1)[:, None]
