@@ -119,6 +119,7 @@ def test_samples_are_extrapolated(porrima, stars_file, write, tmp_path):
     assert (fit["n_samples"], fit["n_dof"], fit["n_stars"]) == (2, 2, 2900)
     assert [r["quantity"] for r in result["values"]] == ["e1", "e2", "r2"]
     assert sum(row["best_share"] for row in result["samples"]) == pytest.approx(1)
+    assert {row["patch"] for row in result["samples"]} == {fit["patch"]}
     assert picture.exists()
 
 

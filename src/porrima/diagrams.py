@@ -267,6 +267,7 @@ def correction_residuals(data: xr.Dataset) -> Figure:
             axis.axhline(0.0, color="0.3", linewidth=0.6)
             axis.set(xlim=(edges[0], edges[-1]), xlabel="$i$ [mag]", ylabel=label)
             axis.ticklabel_format(axis="y", style="sci", scilimits=(0, 0), useMathText=True)
-        figure.axes[0].legend(frameon=False, fontsize=8)
+        handles, names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
         figure.suptitle(f"{data.attrs['psf']}, stacks of {data.attrs['n_stars']} stars", fontsize=9.5)
     return figure

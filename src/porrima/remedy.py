@@ -439,7 +439,7 @@ def _add_fit(out: dict[str, Any], scene: _Scene, name: str, rows: list[int], nes
         }
     )  # fmt: skip
     for i, k in enumerate(rows):
-        at = _row_of(scene.patches, k)
+        at = _row_of(scene.patches, k) | first
         numbers = {"r2": measured[i, -1], "predicted_change": change[i, -1] / r2}
         numbers |= {
             "residual": found.residual[i, -1] / r2,
