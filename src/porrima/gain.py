@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["gain"]
+__all__ = ["gain", "moved_together", "read_either_way", "with_figure_moved"]
 
 
 def gain(
@@ -82,10 +82,10 @@ def gain(
     found = mean_x(start)
     value = np.log(found[0] / found)
     errors = []
-    for down_and_up in _moved(start, multiplicity):
+    for down_and_up in moved_together(start, multiplicity):
         x = np.array([mean_x(populations) for populations in down_and_up])
         errors.append(np.log(x[:, :1] / x) - value)
-    choices = np.array([mean_x(read(*choice)) for choice in _choices(multiplicity, photometry)])
+    choices = np.array([mean_x(read(*choice)) for choice in read_either_way(multiplicity, photometry)])
     envelope = np.log(choices[:, :1] / choices)
     change = np.array(errors)  # (source, 2, bin)
     low = envelope.min(axis=0) - np.sqrt(np.sum(np.minimum(change.min(axis=1), 0.0) ** 2, axis=0))
@@ -98,27 +98,89 @@ def gain(
     )
 
 
-def _moved(start: list[Population], model: MultiplicityModel) -> Iterator[tuple[list[Population], ...]]:
-    """All bins with one figure of one row, or the cut, moved down and up by its error."""
+def moved_together(
+    start: list[Population], model: MultiplicityModel
+) -> Iterator[tuple[list[Population], list[Population]]]:
+    """All bins with one figure of one row, or the cut, moved by its error.
+
+    Parameters
+    ----------
+    start : list of Population
+        One for each bin.
+    model : MultiplicityModel
+        Whose table it is.
+
+    Yields
+    ------
+    down, up : list of Population
+        The bins with the figure lowered and raised by one standard deviation.
+
+    Returns
+    -------
+    None
+        An iterator.
+    """
     for number, row in enumerate(model.row_errors):
         for figure in RowErrors._fields:
-            ends = zip((-1.0, 1.0), getattr(row, figure), strict=True)
-            yield tuple(
-                [_with(p, model, number, figure, sign * error) for p in start] for sign, error in ends
+            low, high = getattr(row, figure)
+            down, up = (
+                [with_figure_moved(p, model, number, figure, change) for p in start]
+                for change in (-low, high)
             )
-    yield tuple([replace(p, cut=p.cut * (1 + sign * CUT_ERROR)) for p in start] for sign in (-1, 1))
+            yield down, up
+    down, up = ([replace(p, cut=p.cut * (1 + sign * CUT_ERROR)) for p in start] for sign in (-1, 1))
+    yield down, up
 
 
-def _with(
+def with_figure_moved(
     population: Population, model: MultiplicityModel, row: int, figure: str, change: float
 ) -> Population:
-    """Population with one figure of the law of companions changed where its stars take a row."""
+    """Population with one figure of the table changed where its stars take a row.
+
+    Parameters
+    ----------
+    population : Population
+        Of n stars.
+    model : MultiplicityModel
+        Whose table it is.
+    row : int
+        As the rows of the model number them.
+    figure : str
+        A field of `companions.RowErrors`.
+    change : float
+        Added to the figure, in its unit.
+
+    Returns
+    -------
+    population : Population
+        With another law of companions.
+    """
     here = np.where(model.rows(population.stars.mass) == row, change, 0.0)
     return replace(population, law=population.law.moved(figure, here))
 
 
-def _choices(model: Any, photometry: MassLuminosity) -> Iterator[tuple[MultiplicityModel, MassLuminosity]]:
-    """Models and relations in all combinations of what may be read either way, as given first."""
+def read_either_way(
+    model: Any, photometry: MassLuminosity
+) -> Iterator[tuple[MultiplicityModel, MassLuminosity]]:
+    """Models and relations in all combinations of what may be read either way, as given first.
+
+    Parameters
+    ----------
+    model : MultiplicityModel
+        As given.
+    photometry : MassLuminosity
+        As given.
+
+    Yields
+    ------
+    model, photometry : MultiplicityModel, MassLuminosity
+        One of the combinations.
+
+    Returns
+    -------
+    None
+        An iterator.
+    """
     lights = [photometry, *(light for light in PHOTOMETRY.values() if light != photometry)]
     options = [[(name, getattr(model, name)), (name, other)] for name, other in model.choices.items()]
     for light, *chosen in itertools.product(lights, *options):
