@@ -14,7 +14,7 @@ import tempfile
 from types import SimpleNamespace
 
 import numba
-from numba import cuda, float32, float64, int32, int64, types
+from numba import cuda, float32, float64, int64, types
 from numba.cuda import dispatcher
 
 from porrima.gpu import _kernel
@@ -26,7 +26,7 @@ RELAXED = re.compile(r"\b(?:div|sqrt|rsqrt|rcp|add|sub|mul|fma|ex2|lg2)\.[a-z.]*
 def signature():
     """Types of the arguments of the kernel."""
     rows, column = float32[:, ::1], float32[::1]
-    fields = {"star": rows, "law": rows, "track": rows, "weight": column, "stay": column, "alias": int32[::1]}
+    fields = {"star": rows, "track": rows, "weight": column, "alias": rows}
     fields |= {"n_grid": int64, "isotropic": types.boolean, "largest_fraction": float64}
     tables = types.NamedTuple([fields.get(name, float32) for name in Tables._fields], Tables)
     return tables, types.uint64, int64, int64[::1], float64[::1], float64[::1], float64[:, ::1]

@@ -22,6 +22,11 @@ CASES = {
     "as the model": ({}, {}, {"n_stars": 2000, "binary_fraction": "model"}),
     "capped": ({}, {}, {"n_stars": 300, "binary_fraction": 0.95}),
     "weighted": ({}, {"stack_weight": "flux"}, {"n_stars": 40, "binary_fraction": 0.9}),
+    "classes": (
+        {"eccentricity": "thermal"},
+        {"stack_weight": "flux"},
+        {"n_stars": 40, "binary_fraction": 0.35},
+    ),
     "inclination-uniform": (
         {"projection": "inclination-uniform", "a_max_factor": 2.5},
         {},

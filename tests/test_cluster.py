@@ -80,6 +80,17 @@ def test_a_range_that_kills_its_worker_ends_the_run():
             list(results)
 
 
+def test_a_worker_that_dies_before_it_is_ready_is_told_in_one_line(tmp_path):
+    deadly_start = tmp_path / "deadly_start.py"
+    deadly_start.write_text("import os\nos._exit(1)\n")
+    with (
+        dask.config.set({"distributed.worker.preload": [str(deadly_start)]}),
+        pytest.raises(RunError, match=r"2 workers cannot be started: one died; .* --resume"),
+        cluster(2, None),
+    ):
+        pass
+
+
 def test_a_worker_of_many_threads_does_one_range_at_a_time_with_all_of_them():
     with cluster(1, None) as one:
         found = list(one.results(spell, RANGES[:6]))

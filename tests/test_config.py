@@ -6,7 +6,7 @@ import yaml
 
 from porrima.config import EXAMPLE, PopulationConfig, RunConfig, canonical, load, parse
 from porrima.errors import InputError
-from porrima.multiplicity import DucheneKraus2013
+from porrima.multiplicity import MULTIPLICITY, DucheneKraus2013
 from porrima.photometry import HabetsHeintze1981, MainSequence
 
 
@@ -86,7 +86,7 @@ def test_models_by_name_and_with_options():
         ),
         (
             {"multiplicity": {"gap_rule": "upper"}},
-            "multiplicity.gap_rule: must be 'lower' or 'solar', got upper",
+            "multiplicity.gap_rule: must be 'lower', 'solar', 'nearest' or 'interpolated', got upper",
         ),
     ],
 )
@@ -100,7 +100,9 @@ def test_unknown_models_suggest_the_nearest():
     config = parse(RunConfig, example(multiplicity="dk14", photometry="main-sequense"))
     with pytest.raises(
         InputError,
-        match=re.escape("multiplicity: must be one of dk13, dk13-kcm16 (did you mean dk13?), got dk14"),
+        match=re.escape(
+            f"multiplicity: must be one of {', '.join(MULTIPLICITY)} (did you mean dk13?), got dk14"
+        ),
     ):
         config.multiplicity.build()
     with pytest.raises(InputError, match="did you mean main-sequence"):

@@ -37,6 +37,7 @@ def simulated():
         ("as the model", 9),
         ("capped", 9),
         ("weighted", 9),
+        ("classes", 9),
         ("inclination-uniform", 9),
     ],
 )

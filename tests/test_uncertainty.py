@@ -5,8 +5,9 @@ import pytest
 
 from porrima import multiplicity, uncertainty
 from porrima.averages import population_moments
+from porrima.companions import RowErrors
 from porrima.integrals import integrate
-from porrima.multiplicity import DucheneKraus2013
+from porrima.multiplicity import COMPILATIONS, MULTIPLICITY, ROW_ERRORS, DucheneKraus2013
 from porrima.photometry import PHOTOMETRY
 from porrima.prediction import predict
 from porrima.psf import psf_from_name
@@ -14,7 +15,7 @@ from porrima.response import response
 from porrima.shapes import estimator_from_name
 from porrima.stars import Stars
 from porrima.systems import Population
-from porrima.uncertainty import NAMES, ROW_ERRORS, RowErrors
+from porrima.uncertainty import NAMES
 
 LIGHT = PHOTOMETRY["main-sequence"]
 NONE = RowErrors(*[(0.0, 0.0)] * 4)
@@ -84,7 +85,7 @@ def test_the_interval_is_the_envelope_of_the_choices_and_the_quadratic_sum_of_th
     found = uncertainty.uncertainty(
         stars, reply, multiplicity=DucheneKraus2013(), photometry=LIGHT, n_stars=40, binary_fraction=0.35
     )
-    rest = [s for s in found.sources if s.kind != "choice"]
+    rest = [s for s in found.sources if s.kind in ("error", "sample")]
     spread = np.sqrt(sum(s.high**2 for s in rest))
     assert np.all(found.high >= found.value + spread - 1e-15)
     assert np.all(found.low <= found.value)
@@ -96,8 +97,40 @@ def test_the_interval_is_the_envelope_of_the_choices_and_the_quadratic_sum_of_th
     assert [reach for _, reach in ranked] == sorted((reach for _, reach in ranked), reverse=True)
     assert {name for name, _ in ranked} == {
         "multiplicity_fraction", "mass_ratio_exponent", "mean_separation", "sigma_log_period",
-        "cut", "photometry", "gap_rule", "projection", "stars",
+        "cut", "photometry", "gap_rule", "projection", "stars", "model",
     }  # fmt: skip
+
+
+def test_the_spread_between_models_is_that_of_their_own_predictions_and_no_part_of_the_interval(stars, reply):
+    found = uncertainty.uncertainty(stars, reply, multiplicity=MULTIPLICITY["dk13"], photometry=LIGHT)
+    assert set(found.models) == set(COMPILATIONS) - {"dk13"}
+    own = {name: eta(stars, reply, MULTIPLICITY[name]) for name in found.models}
+    for name, values in found.models.items():
+        assert values[0] == pytest.approx(own[name], rel=5e-3)
+    one = source(found, "model")
+    assert one.kind == "model"
+    assert one.high[0] == pytest.approx(max(own.values()) - eta_given(found), rel=2e-2)
+    assert found.high[0] < eta_given(found) + one.high[0]
+
+
+@pytest.mark.parametrize("name", ["offner23", "sm22", "modern"])
+def test_every_model_has_errors_of_its_own(stars, reply, name):
+    """The fraction of each row moved down and up, in quadrature, against predictions of laws changed by hand."""
+    model = MULTIPLICITY[name]
+    found = uncertainty.uncertainty(stars, reply, multiplicity=model, photometry=LIGHT)
+    population = Population.of(stars, multiplicity=model, photometry=LIGHT)
+    integrals, row = integrate(population), model.rows(population.stars.mass)
+    squares = 0.0
+    for number, errors in enumerate(model.row_errors):
+        more = np.where(row == number, errors.multiplicity_fraction[1], 0.0)
+        law = population.law
+        changed = dataclasses.replace(law, multiplicity_fraction=law.multiplicity_fraction + more)
+        moments = population_moments(dataclasses.replace(population, law=changed), integrals)
+        squares += (predict(moments, reply, None).eta[0] - eta_given(found)) ** 2
+    assert source(found, "multiplicity_fraction").high[0] == pytest.approx(np.sqrt(squares), rel=0.01)
+    for figure in ("mass_ratio_exponent", "mean_separation", "sigma_log_period", "eccentricity"):
+        one = source(found, figure)
+        assert one.high[0] - one.low[0] > 0
 
 
 def test_fewer_stars_give_nearly_the_same_changes(stars, reply, monkeypatch):

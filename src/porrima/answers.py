@@ -121,6 +121,10 @@ def population_config(**options: Any) -> PopulationConfig:
     for name in ("multiplicity", "photometry"):
         if str(options.get(name, "")).startswith("{"):
             options[name] = _model_with_options(name, options[name])
+    chosen = options.get("selection")
+    if chosen is not None:
+        braces = str(chosen).startswith("{")
+        options["selection"] = _model_with_options("selection", chosen) if braces else {"table": chosen}
     given = {key: value for key, value in options.items() if value is not None}
     stars = {key: value for key, value in given.items() if key in where}
     rest = {key: value for key, value in given.items() if key not in where}
@@ -132,9 +136,12 @@ def _model_with_options(name: str, text: str) -> Any:
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError:
-        raise InputError(
-            "must be a name or {model: name, option: value}", key=f"--{name}", value=text
-        ) from None
+        rule = (
+            "a file or {clip: value, key: value}"
+            if name == "selection"
+            else "a name or {model: name, option: value}"
+        )
+        raise InputError(f"must be {rule}", key=f"--{name}", value=text) from None
 
 
 def predicted(
@@ -169,7 +176,7 @@ def predicted(
     InputError
         If the cut is too wide for kernel moments.
     """
-    population = population_of(config, draw_stars(config))
+    population = population_of(config, draw_stars(config), reply)
     fraction = None if binary_fraction is None else np.array([binary_fraction])
     integrals = integrate(population)
     moments = population_moments(population, integrals, fraction)
@@ -204,7 +211,10 @@ def predicted(
         "population_binary_fraction": moments.binary_fraction[0],
         "unresolved_fraction": moments.unresolved_fraction[0],
         "removed_fraction": moments.removed_fraction[0],
-        "n_catalog_stars": len(population.stars),
+        "missed_fraction": moments.missed_fraction[0],
+        "rejected_fraction": moments.rejected_fraction[0],
+        "false_rejection_fraction": moments.false_rejection_fraction[0],
+        "n_catalog_stars": len(population.primaries),
         **_spread(prediction),
         "quadrature_error": moments.relative_error[0],
         **known,
@@ -273,9 +283,9 @@ def _known(
     """Interval of each quantity, and what moves eta; nothing for stars of unequal weight."""
     names = [f"{name}_{end}" for name in NAMES for end in ("low", "high")]
     if config.stack_weight != "equal":
-        return dict.fromkeys([*names, "sources"])
+        return dict.fromkeys([*names, "sources", "models"])
     found = uncertainty(
-        population.stars,
+        population.primaries,
         reply,
         multiplicity=config.multiplicity.build(),
         photometry=config.photometry.build(),
@@ -283,10 +293,12 @@ def _known(
         binary_fraction=binary_fraction,
         n_stars=n_stars,
         integrals=integrals,
+        selection=population.selection,
     )
     ends = [end for name in NAMES for end in found.interval(name)]
     ranking = [{"source": source, "change": change} for source, change in found.ranking()]
-    return dict(zip(names, ends, strict=True)) | {"sources": ranking}
+    models = [{"model": name, "eta": float(values[0])} for name, values in found.models.items()]
+    return dict(zip(names, ends, strict=True)) | {"sources": ranking, "models": models}
 
 
 def _quantiles(
@@ -327,6 +339,8 @@ def predicted_lines(answer: dict[str, Any]) -> list[list[Any]]:
         lines.append([key, value, *("" if end is None else end for end in known)])
     for row in answer["size_quantiles"] or []:
         lines.append([f"dr2_rel at {row['probability']:g}", row["dr2_rel"], "", ""])
+    for row in answer["models"] or []:
+        lines.append([f"eta by {row['model']}", row["eta"], "", ""])
     for row in answer["sources"] or []:
         lines.append([f"eta moves by {row['source']}", row["change"], "", ""])
     return lines

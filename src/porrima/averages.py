@@ -45,7 +45,11 @@ class PopulationMoments:
     unresolved_fraction : (k,) float array
         Share of pairs among the stars of the stack, in [0, 1].
     removed_fraction : (k,) float array
-        Share of resolved pairs among all pairs, in [0, 1].
+        Share of pairs that are resolved or rejected among all pairs, in [0, 1]; the others are missed.
+    rejected_fraction : (k,) float array
+        Share of the stars that are no resolved pairs which a selection rejects, in [0, 1]; 0 without one.
+    false_rejection_fraction : (k,) float array
+        Share of single stars that a selection rejects, in [0, 1].
     mean_x : (k,) float array
         :math:`\langle x \rangle = \langle f r^2/(1+f)^2 \rangle` with the weights of the stack, in arcsec².
     mean_x2 : (k,) float array
@@ -63,7 +67,7 @@ class PopulationMoments:
         stack; j = 0 counts pairs.  Dimensionless.
     relative_error : (k,) float array
         Of the quadrature: the largest estimate among all powers with j and k above 0 and the mean
-        moments, dimensionless.
+        moments, with a selection among x and x² alone; dimensionless.
 
     Notes
     -----
@@ -75,6 +79,8 @@ class PopulationMoments:
     binary_fraction: FloatArray
     unresolved_fraction: FloatArray
     removed_fraction: FloatArray
+    rejected_fraction: FloatArray
+    false_rejection_fraction: FloatArray
     mean_x: FloatArray
     mean_x2: FloatArray
     effective_share: FloatArray
@@ -83,6 +89,11 @@ class PopulationMoments:
     covariance: FloatArray
     powers: FloatArray
     relative_error: FloatArray
+
+    @property
+    def missed_fraction(self) -> FloatArray:
+        """Share of pairs that stay among all pairs, (k,), in [0, 1]."""
+        return 1.0 - self.removed_fraction
 
     @property
     def equal_weights(self) -> bool:
@@ -117,28 +128,32 @@ def population_moments(
     Notes
     -----
     With :math:`p_i = \min(1, s\, MF_i)`,
-    :math:`\langle x^k \rangle = \sum_i p_i E[x^k; r < r_{cut}]_i / \sum_i (1 - p_i P_{res,i})`.  With weights w a
+    :math:`\langle x^k \rangle = \sum_i p_i E[x^k; r < r_{cut}]_i / \sum_i (1 - p_i P_{res,i})`; with a selection the
+    expectation is over the pairs kept, and the denominator :math:`\sum_i [(1 - p_i) a_i + p_i K_i]` with the
+    probabilities :math:`a_i, K_i` that single stars and pairs are kept.  With weights w a
     stack's moments are the ratio :math:`\sum w k / \sum w`: to first order in 1/N their mean is
     :math:`m - [\langle w^2 k\rangle - m \langle w^2\rangle] / (N \langle w\rangle^2)`, their covariance
     :math:`\langle w^2 (k - m)(k' - m')\rangle / (N \langle w\rangle^2)`, and the effective number is
     :math:`N \langle w\rangle^2/\langle w^2\rangle`.  Exact for equal weights.
     """
-    fraction, w = population.law.multiplicity_fraction, population.weight
+    fraction, number, w = population.law.multiplicity_fraction, population.abundance, population.weight
     scale = population.scale(binary_fraction)
     equal = bool(np.all(w == 1.0))
-    rows = [_star_sums(fraction, integrals, w, 0)]
-    rows.append(rows[0] if equal else _star_sums(fraction, integrals, w**2, 0))
-    rows.append(_star_sums(fraction, integrals, w, 1))
-    rows.append(_star_sums(fraction, integrals, np.ones_like(w), None))
+    rows = [_star_sums(fraction, integrals, number * w, 0)]
+    rows.append(rows[0] if equal else _star_sums(fraction, integrals, number * w**2, 0))
+    rows.append(_star_sums(fraction, integrals, number * w, 1))
+    rows.append(_star_counts(fraction, integrals, number))
     sums = _weighted_sums(np.unique(fraction), np.concatenate(rows, axis=1), scale)
     first, second, coarse, counts = np.split(sums, np.cumsum([r.shape[1] for r in rows[:-1]]), axis=1)
-    pairs, resolved_pairs = counts[:, 0], counts[:, 1]
-    kept = fraction.size - resolved_pairs
+    alone = number if integrals.single_kept is None else number * integrals.single_kept
+    pairs, lost = counts[:, 0], counts[:, 1]
+    kept = alone.sum() - lost
     if np.any(kept < _LEAST_KEPT * fraction.size):
         raise InputError(
             "must leave some pairs unresolved at this binary fraction", key="cut", value=population.cut
         )
-    mean_w, mean_w2 = (w.sum() - first[:, -1]) / kept, ((w**2).sum() - second[:, -1]) / kept
+    mean_w = ((alone * w).sum() - first[:, -1]) / kept
+    mean_w2 = ((alone * w**2).sum() - second[:, -1]) / kept
     powers = _square(first, kept * mean_w)
     squares = _square(second, kept * mean_w**2)
     mean, weighted = _isotropic_means(powers, population.cut), _isotropic_means(squares, population.cut)
@@ -149,8 +164,7 @@ def population_moments(
     return PopulationMoments(
         cut=population.cut,
         binary_fraction=pairs / fraction.size,
-        unresolved_fraction=(pairs - resolved_pairs) / kept,
-        removed_fraction=np.divide(resolved_pairs, pairs, out=np.zeros_like(pairs), where=pairs > 0),
+        **_shares(counts, kept, fraction.size, alone.sum()),
         mean_x=powers[:, 1, 1] * population.cut**2 / 4,
         mean_x2=powers[:, 2, 2] * population.cut**4 / 16,
         effective_share=1 / spread[:, 0],
@@ -158,30 +172,48 @@ def population_moments(
         shift=spread * mean - weighted,
         covariance=covariance,
         powers=powers,
-        relative_error=_relative_error(powers, _square(coarse, kept * mean_w)),
+        relative_error=_relative_error(powers, _square(coarse, kept * mean_w), integrals.joint is None),
     )
 
 
-def _star_sums(
-    fraction: FloatArray, integrals: PairIntegrals, weight: FloatArray, rule: int | None
-) -> FloatArray:
-    """Sums over the stars of each multiplicity fraction, ascending: powers by a rule, and the weight resolved.
-
-    By no rule, the number of stars instead of the powers.
-    """
+def _star_sums(fraction: FloatArray, integrals: PairIntegrals, weight: FloatArray, rule: int) -> FloatArray:
+    """Sums over the stars of each multiplicity fraction, ascending: powers by a rule, and the weight lost to pairs."""
     values, which = np.unique(fraction, return_inverse=True)
-    resolved = np.bincount(which, weights=weight * (1 - integrals.unresolved), minlength=values.size)
-    if rule is None:
-        return np.stack([np.bincount(which, weights=weight, minlength=values.size), resolved], axis=1)
     order = np.argsort(which, kind="stable")
     edges = np.searchsorted(which[order], np.arange(values.size + 1))
     out = np.empty((values.size, _POWERS + 1))
-    out[:, -1] = resolved
+    out[:, -1] = np.bincount(which, weights=weight * integrals.lost, minlength=values.size)
     for k in range(values.size):
         mine = order[edges[k] : edges[k + 1]]
-        coefficient = weight[mine, None] * integrals.coefficient[rule, mine]
-        out[k, :-1] = (coefficient.T @ integrals.separation[rule, mine]).ravel()
+        out[k, :-1] = integrals.sum_of_powers(weight[mine], mine, rule).ravel()
     return out
+
+
+def _star_counts(fraction: FloatArray, integrals: PairIntegrals, number: FloatArray) -> FloatArray:
+    """Stars of each multiplicity fraction: all, what pairs lose against singles, resolved, removed, singles kept."""
+    values, which = np.unique(fraction, return_inverse=True)
+    alone = np.ones_like(fraction) if integrals.single_kept is None else integrals.single_kept
+    columns = [np.ones_like(fraction), integrals.lost, 1 - integrals.unresolved, 1 - integrals.kept, alone]
+    sums = [np.bincount(which, weights=number * c, minlength=values.size) for c in columns]
+    return np.stack(sums, axis=1)
+
+
+def _shares(counts: FloatArray, kept: FloatArray, n: int, alone: float) -> dict[str, FloatArray]:
+    """Shares of pairs and single stars that stay and go, from the sums over pairs of `_star_counts`."""
+    pairs, _, resolved, removed, alone_of_pairs = counts.T
+    singles = n - pairs
+    wrong = np.maximum(singles - (alone - alone_of_pairs), 0.0)
+
+    def share(part: FloatArray, whole: FloatArray) -> FloatArray:
+        out: FloatArray = np.divide(part, whole, out=np.zeros_like(pairs), where=whole > 1e-9 * n)
+        return out
+
+    return {
+        "unresolved_fraction": (pairs - removed) / kept,
+        "removed_fraction": share(removed, pairs),
+        "rejected_fraction": share(np.maximum(n - resolved - kept, 0.0), n - resolved),
+        "false_rejection_fraction": share(wrong, singles),
+    }
 
 
 def _weighted_sums(fraction: FloatArray, columns: FloatArray, scale: FloatArray) -> FloatArray:
@@ -200,10 +232,16 @@ def _square(sums: FloatArray, total: FloatArray) -> FloatArray:
     return (sums[:, :_POWERS] / total[:, None]).reshape(-1, ORDER + 1, ORDER + 1)
 
 
-def _relative_error(fine: FloatArray, coarse: FloatArray) -> FloatArray:
-    """Largest relative difference between two rules among powers of y r² and mean moments, (k,)."""
+def _relative_error(fine: FloatArray, coarse: FloatArray, smooth: bool) -> FloatArray:
+    """Largest relative difference between two rules among powers of y r² and mean moments, (k,).
+
+    Where a selection has an edge below the cut, high powers of r over the cut are small, badly known and of no
+    consequence: of x and x² alone.
+    """
     values = [
         np.concatenate([p[:, 1:, 1:].reshape(-1, ORDER**2), _isotropic_means(p, 1.0)[:, _SIZES]], axis=1)
+        if smooth
+        else p[:, [1, 2], [1, 2]]
         for p in (fine, coarse)
     ]
     difference = np.divide(

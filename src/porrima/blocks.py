@@ -1,7 +1,7 @@
 """Thirty-two pairs at a time: the steps of `pairs` in loops that a CPU's compiler turns into vector instructions.
 
-Each step is a loop over the lanes of a block.  What a pair needs of its star, law and tracks stands in rows of eight
-numbers, which are loaded whole and turned into lanes in registers, where a gather would load every number alone.
+Each step is a loop over the lanes of a block.  What a pair needs of its star and tracks stands in two rows, which are
+loaded by fours and eights and turned into lanes in registers, where a gather would load every number alone.
 """
 
 from __future__ import annotations
@@ -18,18 +18,15 @@ from porrima.moments import N_MOMENTS
 from porrima.pairs import (
     BASE,
     CUT,
-    FLUX,
+    DIMMING,
     FRACTION,
-    LAW,
     MASS,
     Q_FLAT,
     Q_SLOPE,
     Q_START,
     SIGMA,
     TRUNCATION,
-    W1,
-    W2,
-    W3,
+    W0,
     WIDTH,
     A,
     add_moments,
@@ -60,73 +57,124 @@ LANES = 32
 """Pairs in a block: enough for a CPU to work on four vectors of eight at once."""
 
 _SUM_LANES = 8
-_TURNED = 16  # rows turned into columns at a time
 
 X, Y, SEPARATION, FLUX_RATIO, KEPT, VALID = (row * LANES for row in range(6))
 """Rows of a block: companion from primary and the length of that in `pairs.CUT`, flux ratio, weight in the stack (0
 where the pair is resolved or not wanted), and 1, or 0 where there are too many of its star."""
 
-_MASS, _PLACE, _NUMBER, _ROW_NUMBER, _AXIS, _TAIL_X, _TAIL_W = (row * LANES for row in range(6, 13))
-"""More rows: log2 of the companion's mass and its place on the grid; as bits, the number of the star and of a row to
-look up; log2 of the semi-major axis and what it follows from."""
+_MASS, _PLACE, NUMBER, _ROW_NUMBER, _AXIS, _TAIL_X, _TAIL_W, _LEFT, _RIGHT = (
+    row * LANES for row in range(6, 15)
+)
+"""More rows: log2 of the companion's mass and its place on the grid; as bits, the number of the star and of a row of
+tracks; log2 of the semi-major axis and what it follows from; `light` on either side of the place."""
 
-_STAR, _LAW, _TRACK, _WORD = (row * LANES for row in (13, 13 + WIDTH, 13 + 2 * WIDTH, 13 + 3 * WIDTH))
-"""Rows of a block: columns of its rows of the tables, and five random words as bits."""
+_STAR, _WORD = 15 * LANES, 23 * LANES
+"""Rows of a block: the first eight columns of its stars, and five random words as bits."""
 
-_SUMS = (13 + 3 * WIDTH + 5) * LANES
+_SUMS = 28 * LANES
 """Sums of the moments of all blocks that wait to be flushed, rows of `_SUM_LANES`."""
 
 BLOCK_SIZE = _SUMS + N_MOMENTS * _SUM_LANES
 """Numbers in a block: one flat array, since with distances that it knows the compiler vectorises without asking."""
 
 
-def _transposed(builder: Any, rows: list[Any]) -> list[Any]:
-    """Columns of sixteen rows of eight, as vectors of sixteen, in three rounds of exchanges between registers."""
+_PLACE_TYPE = ir.IntType(64)
 
-    def mixed(a: Any, b: Any, lanes: list[int]) -> Any:
-        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), _TURNED), lanes))
 
-    lanes = range(_TURNED)
-    columns = [mixed(rows[k], rows[k + WIDTH], list(lanes)) for k in range(WIDTH)]
-    for step in (1, 2, 4):
-        for k in (k for k in range(WIDTH) if not k & step):
-            a, b = columns[k], columns[k + step]
-            columns[k] = mixed(a, b, [j if not j & step else _TURNED + j - step for j in lanes])
-            columns[k + step] = mixed(a, b, [j + step if not j & step else _TURNED + j for j in lanes])
-    return columns
+class _Rows:
+    """Loads from arrays and stores to a block, the last of them, as an intrinsic writes them down."""
+
+    def __init__(self, context: Any, builder: Any, kinds: Any, arrays: Any) -> None:
+        self.builder = builder
+        self.arrays = [
+            context.make_array(kind)(context, builder, array).data
+            for kind, array in zip(kinds, arrays, strict=True)
+        ]
+
+    def _pointer(self, array: int, place: Any, kind: Any) -> Any:
+        return self.builder.bitcast(self.builder.gep(self.arrays[array], [place]), kind.as_pointer())
+
+    def number(self, place: int) -> Any:
+        """Number that stands as bits in a place of the block."""
+        number = self.builder.load(self._pointer(-1, _PLACE_TYPE(place), ir.IntType(32)))
+        return self.builder.zext(number, _PLACE_TYPE)
+
+    def load(self, array: int, row: Any, width: int, column: int, size: int) -> Any:
+        """So many numbers from a column on, of a row of a table of that width."""
+        place = self.builder.add(self.builder.mul(row, _PLACE_TYPE(width)), _PLACE_TYPE(column))
+        return self.builder.load(self._pointer(array, place, ir.VectorType(ir.FloatType(), size)), align=4)
+
+    def store(self, vector: Any, place: int) -> None:
+        """Put a vector into the block."""
+        self.builder.store(vector, self._pointer(-1, _PLACE_TYPE(place), vector.type), align=4)
+
+    def mixed(self, a: Any, b: Any, lanes: list[int]) -> Any:
+        """Lanes of two vectors, those of the second numbered on."""
+        return self.builder.shuffle_vector(
+            a, b, ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes)
+        )
+
+    def woven(self, a: Any, b: Any, size: int) -> tuple[Any, Any]:
+        """The lower halves of both fours of two vectors of eight, `size` lanes of each in turn, and the upper ones."""
+        lower = [0, 8, 1, 9, 4, 12, 5, 13] if size == 1 else [0, 1, 8, 9, 4, 5, 12, 13]
+        return self.mixed(a, b, lower), self.mixed(a, b, [lane + 2 for lane in lower])
+
+
+_LOWER, _UPPER = [0, 1, 2, 3, 8, 9, 10, 11], [4, 5, 6, 7, 12, 13, 14, 15]
 
 
 @intrinsic
-def _take_rows(_context, table, block, number, place):  # type: ignore[no-untyped-def]
-    """The rows of a table whose numbers stand (as bits) in a row of the block, turned into columns at `place`."""
-    if table.layout != "C":
-        raise TypingError(f"table must be contiguous by rows, got {table}")
-    word = ir.IntType(64)
+def _take_stars(_context, star, block):  # type: ignore[no-untyped-def]
+    """The first columns of the stars whose numbers stand in a block: eight rows at a time, four columns of each."""
 
-    def code(context, builder, _signature, arguments):  # type: ignore[no-untyped-def]
-        source, target = (
-            context.make_array(kind)(context, builder, argument).data
-            for kind, argument in zip((table, block), arguments[:2], strict=True)
-        )
-        first, to = (context.cast(builder, argument, kind, types.int64)
-                     for argument, kind in zip(arguments[2:], (number, place), strict=True))  # fmt: skip
-
-        def at(array: Any, index: Any, kind: Any) -> Any:
-            return builder.bitcast(builder.gep(array, [index]), kind.as_pointer())
-
-        def row(lane: int) -> Any:
-            where = builder.load(at(target, builder.add(first, word(lane)), ir.IntType(32)))
-            start = builder.mul(builder.zext(where, word), word(WIDTH))
-            return builder.load(at(source, start, ir.VectorType(ir.FloatType(), WIDTH)), align=4)
-
-        for lane in range(0, LANES, _TURNED):
-            columns = _transposed(builder, [row(lane + k) for k in range(_TURNED)])
-            for k, column in enumerate(columns):
-                start = builder.add(to, word(k * LANES + lane))
-                builder.store(column, at(target, start, column.type), align=4)
+    def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        rows = _Rows(context, builder, signature.args, arguments)
+        for lane, column in ((lane, column) for lane in range(0, LANES, 8) for column in (0, 4)):
+            fours = [rows.load(0, rows.number(NUMBER + lane + k), WIDTH, column, 4) for k in range(8)]
+            a, b, c, d = (rows.mixed(fours[k], fours[k + 4], list(range(8))) for k in range(4))
+            (a, b), (c, d) = rows.woven(a, b, 1), rows.woven(c, d, 1)
+            for k, turned in enumerate((*rows.woven(a, c, 2), *rows.woven(b, d, 2))):
+                rows.store(turned, _STAR + (column + k) * LANES + lane)
         return context.get_dummy_value()
 
-    return types.void(table, block, number, place), code
+    return types.void(*_by_rows(star, block)), code
+
+
+@intrinsic
+def _take_tracks(_context, star, track, block):  # type: ignore[no-untyped-def]
+    """`light` of the track rows whose numbers stand in a block: each is weighed whole and summed while it is turned."""
+
+    def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        rows = _Rows(context, builder, signature.args, arguments)
+
+        def weighed(lane: int) -> Any:
+            own = rows.number(NUMBER + lane)
+            weight, dimming = rows.load(0, own, WIDTH, W0, 4), rows.load(0, own, WIDTH, DIMMING, 1)
+            row = rows.load(1, rows.number(_ROW_NUMBER + lane), 8, 0, 8)
+            product = builder.fmul(row, rows.mixed(weight, weight, [0, 1, 2, 3] * 2), flags=("contract",))
+            return builder.fadd(product, rows.mixed(dimming, dimming, [0] * 8), flags=("contract",))
+
+        for lane in range(0, LANES, 8):
+            parts = [weighed(lane + k) for k in range(8)]
+            for size in (1, 2):
+                parts = [
+                    builder.fadd(*rows.woven(a, b, size))
+                    for a, b in zip(parts[::2], parts[1::2], strict=True)
+                ]
+            early, late = parts
+            rows.store(rows.mixed(early, late, _LOWER), _LEFT + lane)
+            rows.store(rows.mixed(early, late, _UPPER), _RIGHT + lane)
+        return context.get_dummy_value()
+
+    return types.void(*_by_rows(star, track, block)), code
+
+
+def _by_rows(*arrays: Any) -> tuple[Any, ...]:
+    """The same types, where all are contiguous."""
+    for array in arrays:
+        if array.layout != "C":
+            raise TypingError(f"tables must be contiguous by rows, got {array}")
+    return arrays
 
 
 @intrinsic
@@ -174,7 +222,7 @@ def _draw_words(isotropic, block, key_low, key_high, stack_low, stack_high, firs
 @_loop
 def _primaries(alias, block):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
-        block[_NUMBER + lane] = from_bits(int32(primary(uint32(bits(block[_WORD + lane])), alias)))
+        block[NUMBER + lane] = from_bits(int32(primary(uint32(bits(block[_WORD + lane])), alias)))
 
 
 @_loop
@@ -183,18 +231,18 @@ def _axes(block):  # type: ignore[no-untyped-def]
     tails = int32(0)
     for lane in range(LANES):
         x = axis_argument(
-            uint32(bits(block[_WORD + 2 * LANES + lane])), block[_LAW + TRUNCATION * LANES + lane]
+            uint32(bits(block[_WORD + 2 * LANES + lane])), block[_STAR + TRUNCATION * LANES + lane]
         )
         w = normal_argument(x)
         block[_TAIL_X + lane], block[_TAIL_W + lane] = x, w
         tails |= int32(w >= float32(TAIL))
         block[_AXIS + lane] = block[_STAR + A * LANES + lane] + block[
-            _LAW + SIGMA * LANES + lane
+            _STAR + SIGMA * LANES + lane
         ] * normal_centre(x, w)
     if tails != 0:
         for lane in range(LANES):
             x, w = block[_TAIL_X + lane], block[_TAIL_W + lane]
-            far = block[_STAR + A * LANES + lane] + block[_LAW + SIGMA * LANES + lane] * normal_tail(x, w)
+            far = block[_STAR + A * LANES + lane] + block[_STAR + SIGMA * LANES + lane] * normal_tail(x, w)
             block[_AXIS + lane] = block[_AXIS + lane] if w < float32(TAIL) else far
 
 
@@ -212,8 +260,8 @@ def _companion_masses(block):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
         block[_MASS + lane] = companion_mass(
             uint32(bits(block[_WORD + LANES + lane])), block[_STAR + MASS * LANES + lane],
-            block[_LAW + Q_SLOPE * LANES + lane], block[_LAW + Q_START * LANES + lane],
-            block[_LAW + Q_FLAT * LANES + lane],
+            block[_STAR + Q_SLOPE * LANES + lane], block[_STAR + Q_START * LANES + lane],
+            block[_STAR + Q_FLAT * LANES + lane],
         )  # fmt: skip
 
 
@@ -228,25 +276,21 @@ def _places(start, per_unit, n_grid, block):  # type: ignore[no-untyped-def]
 @_loop
 def _flux_ratios(log_dark, block):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
-        star, track = _STAR + lane, _TRACK + lane
         block[FLUX_RATIO + lane] = flux_ratio(
-            block[star + W1 * LANES], block[star + W2 * LANES], block[star + W3 * LANES], block[_PLACE + lane],
-            block[track], block[track + LANES], block[track + 2 * LANES], block[track + 3 * LANES],
-            block[track + 4 * LANES], block[track + 5 * LANES], block[track + 6 * LANES],
-            block[track + 7 * LANES], block[star + FLUX * LANES], block[_MASS + lane] < log_dark,
-        )  # fmt: skip
+            block[_LEFT + lane], block[_RIGHT + lane], block[_PLACE + lane], block[_MASS + lane] < log_dark
+        )
 
 
 @_loop
-def _validity(scale, is_capped, block):  # type: ignore[no-untyped-def]
+def _validity(scale, is_capped, star, block):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
         block[VALID + lane] = float32(1)
     if is_capped:
         for lane in range(LANES):
             mass_word = uint32(bits(block[_WORD + LANES + lane]))
             axis_word = uint32(bits(block[_WORD + 2 * LANES + lane]))
-            gone = is_too_many(mass_word, axis_word, scale, block[_LAW + FRACTION * LANES + lane])
-            block[VALID + lane] = float32(0) if gone else float32(1)
+            fraction = star[bits(block[NUMBER + lane]), FRACTION]
+            block[VALID + lane] = float32(not is_too_many(mass_word, axis_word, scale, fraction))
 
 
 @_loop
@@ -264,15 +308,14 @@ def draw_block(tables, block, scale, key_low, key_high, stack_low, stack_high, f
     """Draw the pairs of one block; `first` is the number of the first in its stack."""
     _draw_words(tables.isotropic, block, key_low, key_high, stack_low, stack_high, first)
     _primaries(tables.alias, block)
-    _take_rows(tables.star, block, _NUMBER, _STAR)
-    _take_rows(tables.law, block, _STAR + LAW * LANES, _LAW)
+    _take_stars(tables.star, block)
     _axes(block)
     _separations(tables.isotropic, block)
     _companion_masses(block)
     _places(tables.grid_start, tables.grid_per_unit, tables.n_grid, block)
-    _take_rows(tables.track, block, _ROW_NUMBER, _TRACK)
+    _take_tracks(tables.star, tables.track, block)
     _flux_ratios(tables.log_dark, block)
-    _validity(scale, scale * tables.largest_fraction > 1.0, block)
+    _validity(scale, scale * tables.largest_fraction > 1.0, tables.star, block)
 
 
 @_loop
@@ -310,7 +353,7 @@ def weigh_block(weight, block):  # type: ignore[no-untyped-def]
     """Total weight of the kept pairs of a block, each given that of its star."""
     total = 0.0
     for lane in range(LANES):
-        block[KEPT + lane] *= weight[bits(block[_NUMBER + lane])]
+        block[KEPT + lane] *= weight[bits(block[NUMBER + lane])]
         total += block[KEPT + lane]
     return total
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from porrima.averages import population_moments
+from porrima.companions import MassRangeWarning
 from porrima.errors import InputError
 from porrima.integrals import PairIntegrals, integrate, separation_moments
 from porrima.prediction import MANY_STARS, SeriesWarning, predict
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from porrima.companions import MultiplicityModel
     from porrima.galaxies import Galaxies
     from porrima.instruments import Requirement
-    from porrima.multiplicity import DucheneKraus2013
     from porrima.photometry import MassLuminosity
     from porrima.prediction import Prediction
     from porrima.response import Response
@@ -65,7 +66,7 @@ class Setting:
         Of PSF and estimator.
     n_stars : int
         Stars from which the PSF of a patch is made (count).
-    multiplicity : DucheneKraus2013
+    multiplicity : MultiplicityModel
         Companions of stars.
     photometry : MassLuminosity
         Mass to light.
@@ -82,7 +83,7 @@ class Setting:
     requirement: Requirement
     response: Response
     n_stars: int
-    multiplicity: DucheneKraus2013
+    multiplicity: MultiplicityModel
     photometry: MassLuminosity
     cut: float
     binary_fraction: float | None = None
@@ -210,7 +211,7 @@ def _of_bin(setting: Setting, magnitude: tuple[float, float], stars: Stars) -> M
         n_catalog_stars=len(stars),
         uncertainty=known,
         shares=shares,
-        widest_cut=_widest_cuts(setting, population, integrals, shares),
+        widest_cut=_widest_cuts(setting, stars, population, integrals, shares),
     )
 
 
@@ -287,18 +288,24 @@ def _refined(
 
 
 def _widest_cuts(
-    setting: Setting, population: Population, integrals: PairIntegrals, shares: tuple[Share, ...]
+    setting: Setting,
+    stars: Stars,
+    population: Population,
+    integrals: PairIntegrals,
+    shares: tuple[Share, ...],
 ) -> dict[str, float]:
     """Widest cut that meets the requirements of each group, between cuts that are tried, linear in logarithms."""
     required = [s for s in shares if s.required is not None]
-    step = math.ceil(len(population.stars) / MOST_STARS)
-    some = Population.of(
-        population.stars.take(np.arange(0, len(population.stars), step)),
-        multiplicity=setting.multiplicity,
-        photometry=setting.photometry,
-        cut=setting.cut,
-    )
-    coefficient = integrals.coefficient[:, ::step]
+    step = math.ceil(len(stars) / MOST_STARS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MassRangeWarning)
+        some = Population.of(
+            stars.take(np.arange(0, len(stars), step)),
+            multiplicity=setting.multiplicity,
+            photometry=setting.photometry,
+            cut=setting.cut,
+        )
+    coefficient = integrals.coefficient[:, population.law.star % step == 0]
     totals = np.array(
         [_totals(setting, replace(some, cut=setting.cut * f), coefficient, required) for f in CUTS]
     )

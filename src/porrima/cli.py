@@ -14,6 +14,28 @@ import typer
 from typer.exceptions import TyperException
 
 from porrima.errors import InputError, RunError
+from porrima.options import (
+    Band,
+    Catalogue,
+    Colour,
+    EstimatorName,
+    Format,
+    Jitter,
+    Json,
+    Latitude,
+    Longitude,
+    Mag,
+    Mapping,
+    MultiplicityName,
+    PhotometryName,
+    Pixel,
+    PixelScale,
+    Psf,
+    ReaderOptions,
+    Seed,
+    table_of,
+)  # fmt: skip
+from porrima.survey_commands import budget, correct
 from porrima.terminal import Progress, show
 
 __all__ = ["app", "main"]
@@ -28,42 +50,6 @@ app = typer.Typer(
 )
 
 _INTERRUPTED = 130  # what typer makes of Ctrl-C
-
-Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
-Seed = Annotated[int, typer.Option("--seed", help="Of everything that is drawn.")]
-Longitude = Annotated[float | None, typer.Option("--l", help="Galactic longitude [deg].")]
-Latitude = Annotated[float | None, typer.Option("--b", help="Galactic latitude [deg].")]
-Catalogue = Annotated[
-    Path | None, typer.Option("--catalog", help="A real catalogue instead of the analytic Galaxy.")
-]
-Format = Annotated[str | None, typer.Option("--format", help="Of the catalogue; recognised when not given.")]
-Mapping = Annotated[str | None, typer.Option("--map", help="Its columns: mass=M,distance=D,magnitude=I.")]
-ReaderOptions = Annotated[
-    str | None, typer.Option("--options", help="Of its format: binaries=drop, ruwe_max=1.4, ...")
-]
-Band = Annotated[str | None, typer.Option("--band", help="Of the magnitudes; i, or the catalogue's own.")]
-Mag = Annotated[tuple[float, float], typer.Option("--mag", help="Magnitude range [lo, hi).", metavar="LO HI")]
-MultiplicityName = Annotated[
-    str, typer.Option("--multiplicity", help="dk13, dk13-kcm16, or {model: dk13, gap_rule: solar, ...}.")
-]
-PhotometryName = Annotated[
-    str,
-    typer.Option(
-        "--photometry", help="main-sequence, habets-heintze, or {model: habets-heintze, branch: primary}."
-    ),
-]
-Psf = Annotated[str, typer.Option("--psf", help="Name of the PSF.")]
-Pixel = Annotated[float | None, typer.Option("--pixel", help="Side of a pixel to convolve with [arcsec].")]
-PixelScale = Annotated[float | None, typer.Option("--pixel-scale", help="Of a FITS image [arcsec].")]
-Jitter = Annotated[
-    float | None, typer.Option("--jitter", help="Sigma of a Gaussian to convolve with [arcsec].")
-]
-Colour = Annotated[
-    str | None, typer.Option("--colour", help="Band of the PSF: adds what the companions' colour does.")
-]
-EstimatorName = Annotated[
-    str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")
-]
 
 
 @app.command()
@@ -105,8 +91,8 @@ def stars(
         )  # fmt: skip
         read = catalog_of(config)
     selected = draw_stars(config, read)
-    law = config.multiplicity.build().companions(selected.mass)
-    counts = selected.counts(mag, law.multiplicity_fraction)
+    law = config.multiplicity.build().companions(selected.mass, selected.metallicity)
+    counts = selected.counts(mag, law.multiplicity_fraction[law.first])
     if output is not None:
         write_stars(selected, output)
     if plot is not None:
@@ -167,6 +153,9 @@ def predict(
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
     cut: Annotated[float, typer.Option(help="Separation from which a pair is resolved [arcsec].")] = 0.05,
+    selection: Annotated[
+        str | None, typer.Option(help="Table of what is rejected, or {clip: T, noise: SIGMA, ...}.")
+    ] = None,
     stack_weight: Annotated[str, typer.Option(help="equal, or flux.")] = "equal",
     colour: Colour = None,
     seed: Seed = 1,
@@ -179,14 +168,14 @@ def predict(
     from porrima.response import response
     from porrima.shapes import estimator_from_name
 
-    catalog, format = _table_of(stars, catalog, format)  # noqa: A001
+    catalog, format = table_of(stars, catalog, format)  # noqa: A001
     if binary_fraction is not None and not 0 <= binary_fraction <= 1:
         raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     if n_stars is not None and n_stars < 1:
         raise InputError("must be at least 1", key="--n-stars", value=n_stars)
     config = population_config(
         l=l, b=b, catalog=catalog, format=format, map=map, options=options, band=band, mag=mag, seed=seed,
-        multiplicity=multiplicity, photometry=photometry, cut=cut, stack_weight=stack_weight,
+        multiplicity=multiplicity, photometry=photometry, cut=cut, selection=selection, stack_weight=stack_weight,
     )  # fmt: skip
     profile = psf_from_name(psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter)
     method = estimator_from_name(estimator)
@@ -196,69 +185,8 @@ def predict(
     show(result, as_json, header, PREDICTED_COLUMNS, predicted_lines(result))
 
 
-@app.command()
-def budget(
-    *,
-    instrument: Annotated[
-        str | None, typer.Option(help="euclid-vis, roman-h158, rubin, kcm16 or massey13.")
-    ] = None,
-    requirements: Annotated[Path | None, typer.Option(help="YAML file: sigma_e, sigma_r2, m, c.")] = None,
-    stars: Annotated[Path | None, typer.Option("--stars", help="Table as `porrima stars` writes it.")] = None,
-    catalog: Catalogue = None,
-    format: Format = None,  # noqa: A002
-    map: Mapping = None,  # noqa: A002
-    options: ReaderOptions = None,
-    l: Longitude = None,
-    b: Latitude = None,
-    mag: Mag = (16.0, 24.0),
-    bins: Annotated[int | None, typer.Option(help="Equal bins of magnitude.")] = None,
-    step: Annotated[float | None, typer.Option(help="Width of a bin [mag]; 1 if not given.")] = None,
-    psf: Annotated[str | None, typer.Option("--psf", help="Name of the PSF; the instrument's.")] = None,
-    pixel: Pixel = None,
-    pixel_scale: PixelScale = None,
-    jitter: Jitter = None,
-    estimator: EstimatorName = "adaptive",
-    n_stars: Annotated[int, typer.Option(help="From which the PSF of a patch is made.")] = 2000,
-    binary_fraction: Annotated[
-        float | None, typer.Option(help="0 to 1; as the model gives it if not given.")
-    ] = None,
-    galaxy_size: Annotated[
-        float | None, typer.Option(help="Half-light radius of exponential galaxies [arcsec]; 0.3.")
-    ] = None,
-    galaxies: Annotated[
-        str | None, typer.Option(help="Table, or {half_light_radius: R, scatter: S, index: N, ...}.")
-    ] = None,
-    multiplicity: MultiplicityName = "dk13",
-    photometry: PhotometryName = "main-sequence",
-    band: Band = None,
-    cut: Annotated[float | None, typer.Option(help="Separation of resolved pairs [arcsec].")] = None,
-    colour: Colour = None,
-    seed: Seed = 1,
-    plot: Annotated[Path | None, typer.Option(help="Picture to write: PNG, PDF or SVG.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="ECSV file to write.")] = None,
-    as_json: Json = False,
-) -> None:
-    """Share of a survey's requirements that unresolved binaries use, by magnitude."""
-    from porrima.decision import decided
-    from porrima.ledger import BUDGET_COLUMNS, budget_lines, header_of, write_budget
-
-    catalog, format = _table_of(stars, catalog, format)  # noqa: A001
-    result, found = decided(
-        instrument=instrument, requirements=requirements, galaxy_size=galaxy_size, galaxies=galaxies, mag=mag,
-        bins=bins, step=step, psf=psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter, estimator=estimator,
-        n_stars=n_stars, binary_fraction=binary_fraction, cut=cut, l=l, b=b, catalog=catalog, format=format, map=map,
-        options=options, band=band, colour=colour, seed=seed, multiplicity=multiplicity, photometry=photometry,
-    )  # fmt: skip
-    write_budget(result, output, plot)
-    show(result, as_json, header_of(result, multiplicity), BUDGET_COLUMNS, budget_lines(found))
-
-
-def _table_of(stars: Path | None, catalog: Path | None, format: str | None) -> tuple[Path | None, str | None]:  # noqa: A002
-    """Catalogue and format, where --stars may stand for both."""
-    for key, value in (("--catalog", catalog), ("--format", format)):
-        if stars is not None and value is not None:
-            raise InputError(f"cannot be given together with {key}", key="--stars", value=stars)
-    return (catalog, format) if stars is None else (stars, "table")
+app.command()(budget)
+app.command()(correct)
 
 
 @app.command()

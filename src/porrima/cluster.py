@@ -164,6 +164,8 @@ def cluster(workers: int | None, scheduler: str | None) -> Iterator[Cluster | No
     ------
     InputError
         If Dask is not installed, or the scheduler cannot be reached.
+    RunError
+        If a worker dies before it is ready.
     """
     if workers is None and scheduler is None:
         yield None
@@ -201,6 +203,8 @@ def _local(workers: int) -> Iterator[Any]:
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # threads and processes inherit it
         try:
             here = LocalCluster(**options, dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL)
+        except RuntimeError:  # a worker died before it was ready, killed for its memory, say
+            raise RunError(f"{workers} workers cannot be started: one died; {_GO_ON}") from None
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         with here:

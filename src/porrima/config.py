@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import math
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -14,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from porrima.errors import InputError
 
 __all__ = [
-    "EXAMPLE", "GalaxiesConfig", "Multiplicity", "PopulationConfig", "RequirementConfig", "RunConfig", "StarsConfig",
-    "load", "load_requirement", "parse",
+    "EXAMPLE", "GalaxiesConfig", "Multiplicity", "PopulationConfig", "RequirementConfig", "RunConfig",
+    "SelectionConfig", "StarsConfig", "load", "load_requirement", "parse",
 ]  # fmt: skip
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -25,6 +26,7 @@ stars: {l: 180, b: 45, band: i, mag: [18, 19]}     # or {catalog: FILE, format: 
 multiplicity: dk13                                  # or {model: dk13, gap_rule: solar, a_max_factor: 2.5, ...}
 photometry: main-sequence                           # or habets-heintze, {model: habets-heintze, branch: primary}
 cut: 0.05                                           # arcsec
+# selection: {clip: 0.016, noise: 0.004, psf: psf0}   # or {table: FILE}: what else is rejected
 stack_weight: equal                                 # or flux
 psf: [psf0, psf1, psf2]
 estimator: adaptive                                 # or plain, gaussian:0.75
@@ -72,11 +74,13 @@ class Multiplicity(_Strict):
     """A named multiplicity model with any of its options changed."""
 
     model: str = "dk13"
-    gap_rule: Literal["lower", "solar"] | None = None
+    gap_rule: Literal["lower", "solar", "nearest", "interpolated"] | None = None
     a_max_factor: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     scatter_scale: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     projection: Literal["isotropic", "inclination-uniform"] | None = None
     mass_ratio_min: float | None = Field(default=None, gt=0, lt=1)
+    eccentricity: Literal["circular", "uniform", "thermal", "mds17"] | None = None
+    metallicity: Literal["none", "moe19"] | None = None
 
     def build(self) -> Any:
         """The model itself.
@@ -95,6 +99,12 @@ class Multiplicity(_Strict):
 
         named = known("multiplicity", self.model, MULTIPLICITY)
         options = self.model_dump(exclude={"model"}, exclude_unset=True)
+        own = {field.name for field in dataclasses.fields(named)}
+        for name in options.keys() - own:
+            raise InputError(
+                f"is no option of {self.model}, which has {', '.join(sorted(own))}",
+                key=f"multiplicity.{name}",
+            )
         try:
             return dataclasses.replace(named, **options)
         except (TypeError, ValueError) as error:
@@ -132,6 +142,34 @@ class Photometry(_Strict):
         return dataclasses.replace(named, branch=self.branch)
 
 
+class SelectionConfig(_Strict):
+    """What else is rejected: stars of an odd shape, or by a table of the user's own; both where both are given."""
+
+    clip: float | None = Field(default=None, gt=0, le=0.2)  # largest change of a star's own shape
+    quantity: Literal["r2", "e"] = "r2"
+    noise: float | dict[float, float] | None = None  # sigma of the change, or sigma by magnitude
+    psf: str | None = None  # that stars are clipped behind, where there are several
+    table: Path | None = None
+
+    @model_validator(mode="after")
+    def _something(self) -> SelectionConfig:
+        if self.clip is None and self.table is None:
+            raise ValueError("must have clip or table")
+        if self.clip is None and self.noise is not None:
+            raise ValueError("must have clip, too, where it has noise")
+        return self
+
+    @field_validator("noise")
+    @classmethod
+    def _sigma(cls, value: Any) -> Any:
+        sigmas = value.values() if isinstance(value, dict) else [0.0 if value is None else value]
+        if not sigmas or not all(
+            0 <= s < math.inf and (s > 0 or not isinstance(value, dict)) for s in sigmas
+        ):
+            raise ValueError(f"must be a positive sigma, or one for each magnitude, got {value}")
+        return value
+
+
 class PopulationConfig(_Strict):
     """Stars, companions and what is resolved."""
 
@@ -139,6 +177,7 @@ class PopulationConfig(_Strict):
     multiplicity: Multiplicity = Multiplicity()
     photometry: Photometry = Photometry()
     cut: float = Field(default=0.05, gt=0, allow_inf_nan=False)
+    selection: SelectionConfig | None = None
     stack_weight: Literal["equal", "flux"] = "equal"
     seed: int = Field(default=1, ge=0, lt=2**64, strict=True)
 
@@ -271,7 +310,7 @@ def load(path: Path) -> RunConfig:
     Parameters
     ----------
     path : Path
-        The file; a relative ``catalog`` in it is relative to its folder.
+        The file; a relative ``catalog`` or ``table`` in it is relative to its folder.
 
     Returns
     -------
@@ -287,6 +326,11 @@ def load(path: Path) -> RunConfig:
     if config.stars.catalog is not None:
         stars = config.stars.model_copy(update={"catalog": path.parent / config.stars.catalog})
         config = config.model_copy(update={"stars": stars})
+    if config.selection is not None and config.selection.table is not None:
+        selection = config.selection.model_copy(
+            update={"table": (path.parent / config.selection.table).resolve()}
+        )
+        config = config.model_copy(update={"selection": selection})
     return config
 
 
@@ -399,6 +443,7 @@ def _keys(model: type[BaseModel], location: list[str]) -> list[str]:
     """Names of the keys at a place inside a model."""
     for part in location:
         inner = model.model_fields[part].annotation if part in model.model_fields else None
+        inner = next((kind for kind in get_args(inner) if kind is not type(None)), inner)
         if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
             return []
         model = inner

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from porrima.shapes import Estimator
     from porrima.stars import Stars
 
-__all__ = ["decided", "galaxies_of", "magnitude_bins", "survey_of"]
+__all__ = ["decided", "galaxies_of", "magnitude_bins", "profile_of", "seen_by", "survey_of"]
 
 GALAXY_SIZE = 0.3
 """Half-light radius of the exponential galaxies that are taken where none are given, in arcsec."""
@@ -230,7 +230,7 @@ def decided(
     sizes, ranges = galaxies_of(galaxy_size, galaxies), magnitude_bins(mag, bins, step)
     config = population_config(**options, mag=mag, cut=survey.cut if cut is None else cut)
     method = estimator_from_name(estimator)
-    profile = _profile(survey, psf, pixel, pixel_scale, jitter)
+    profile = profile_of(survey, psf, pixel, pixel_scale, jitter)
     waves = None
     if colour is not None:
         own = (survey.pixel, survey.jitter) if psf is None else (None, None)
@@ -246,7 +246,7 @@ def decided(
         cut=config.cut,
         binary_fraction=binary_fraction,
         fit=fit_response(profile, sizes),
-        seen=_seen(method, sizes, profile),
+        seen=seen_by(method, sizes, profile),
     )
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -271,10 +271,30 @@ def _colours(
     return colour_answer(config, population, integrate(population), waves, r2_0, fraction)
 
 
-def _profile(
+def profile_of(
     survey: Survey, psf: str | None, pixel: float | None, pixel_scale: float | None, jitter: float | None
 ) -> PSF:
-    """PSF that was asked for, or the survey's."""
+    """PSF that was asked for, or the survey's.
+
+    Parameters
+    ----------
+    survey : Survey
+        Gives PSF, pixel and jitter where they are not given.
+    psf : str or None
+        Its name.
+    pixel, pixel_scale, jitter : float or None
+        In arcsec.
+
+    Returns
+    -------
+    psf : PSF
+        Convolved with pixel and jitter.
+
+    Raises
+    ------
+    InputError
+        If there is no such PSF.
+    """
     if psf is not None:
         return psf_from_name(psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter)
     own: dict[str, Any] = {
@@ -309,8 +329,23 @@ def _stars_of(
     return parts
 
 
-def _seen(estimator: Estimator, galaxies: Galaxies, psf: PSF) -> Galaxies | None:
-    """Sizes as a method that subtracts moments sees them; None where there is no such method."""
+def seen_by(estimator: Estimator, galaxies: Galaxies, psf: PSF) -> Galaxies | None:
+    """Sizes as a method that subtracts moments of the PSF sees them.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        Of the moments.
+    galaxies : Galaxies
+        Whose shear is measured.
+    psf : PSF
+        Behind which they are seen.
+
+    Returns
+    -------
+    galaxies : Galaxies or None
+        None where there is no such method.
+    """
     if isinstance(estimator, Plain):
         return galaxies
     return seen_by_regauss(galaxies, psf) if isinstance(estimator, Adaptive) else None

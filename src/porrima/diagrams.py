@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any
 
 from matplotlib import colormaps, rc_context
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from porrima.instruments import Requirement
 
-__all__ = ["against_magnitude", "budget_shares", "colour_against_eta"]
+__all__ = ["against_magnitude", "budget_shares", "colour_against_eta", "correction_residuals", "corrections"]
 
 _RED = "#b00020"
 _TITLES = {"psf": "shape of the PSF", "fit": "shear, fit", "moments": "shear, moments"}
@@ -202,3 +203,115 @@ def _magnitude_legend(figure: Figure, axes: Any, data: xr.Dataset, requirement: 
     handles = [axes[0, 0].plot([], [], **look)[0] for look, _ in entries]
     labels = [label for _, label in entries]
     figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize=8.5)
+
+
+def corrections(answer: dict[str, Any]) -> Figure:
+    """Corrected shapes, patch by patch, or sizes of samples against what companions are to add to them.
+
+    Parameters
+    ----------
+    answer : dict
+        As `porrima correct --json` prints it, dimensionless and arcsec².
+
+    Returns
+    -------
+    figure : Figure
+        Ready to be written.
+    """
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        if "samples" in answer:
+            return _extrapolations(answer)
+        quantities = list(dict.fromkeys(row["quantity"] for row in answer["values"]))
+        figure = Figure(figsize=(7.4, 2.2 * len(quantities)), layout="constrained")
+        for axis, quantity in zip(
+            figure.subplots(len(quantities), 1, sharex=True, squeeze=False)[:, 0], quantities, strict=True
+        ):
+            rows = [row for row in answer["values"] if row["quantity"] == quantity]
+            number = range(1, len(rows) + 1)
+            corrected = [row["corrected"] for row in rows]
+            sides = [
+                [row["corrected"] - row["low"] for row in rows],
+                [row["high"] - row["corrected"] for row in rows],
+            ]
+            axis.plot(
+                number, [row["measured"] for row in rows], "o", color=COLOURS[1], mfc="none", label="measured"
+            )
+            axis.errorbar(
+                number, corrected, yerr=sides, fmt="s", color=COLOURS[0], markersize=4, label="corrected"
+            )
+            axis.set_ylabel(_LABELS[quantity] + (" [arcsec$^2$]" if quantity == "r2" else ""))
+        axis.set_xlabel("patch")
+        axis.xaxis.get_major_locator().set_params(integer=True)
+        axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _extrapolations(answer: dict[str, Any]) -> Figure:
+    """Size of each sample over the fitted one against the change that is predicted, with the fits."""
+    figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+    axis = figure.subplots()
+    for colour, fit in zip(itertools.cycle(COLOURS), answer["fits"], strict=False):
+        rows = [row for row in answer["samples"] if row["patch"] == fit["patch"]]
+        change = [row["predicted_change"] for row in rows]
+        line = [0.0, max(change)]
+        fitted = [fit["amplitude"] * x for x in line]
+        size = [fit["amplitude"] * x + row["residual"] for x, row in zip(change, rows, strict=True)]
+        axis.plot(line, fitted, color=colour, linewidth=1.2)
+        axis.plot(change, size, "o", color=colour, markersize=4, label=f"patch {fit['patch']}")
+        axis.errorbar([0.0], [0.0], yerr=[fit["error_r2"]], color=colour, capsize=3)
+    axis.set(xlabel=r"predicted $\delta R^2/R_0^2$", ylabel=r"$R^2/R_0^2 - 1$, $R_0^2$ as fitted")
+    if len(answer["fits"]) <= len(COLOURS):
+        axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def correction_residuals(data: xr.Dataset) -> Figure:
+    """Size and ellipticity of simulated stacks before and after a correction, against magnitude.
+
+    Parameters
+    ----------
+    data : Dataset
+        From `trials.trials`: dimensionless against mag.
+
+    Returns
+    -------
+    figure : Figure
+        Symbols are means over the trials with the range of two thirds of them; the band is the forecast of one standard
+        deviation about 0, the hatched one that of the extrapolation over all magnitudes.
+    """
+    middle = 0.5 * (data["mag_lo"] + data["mag_hi"])
+    edges = [*data["mag_lo"].to_numpy(), float(data["mag_hi"][-1])]
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(7.4, 3.4), layout="constrained")
+        labels = {"r2": r"$R^2/R_0^2 - 1$", "e1": r"$e_1 - e_{1,0}$"}
+        for axis, (quantity, label) in zip(figure.subplots(1, 2), labels.items(), strict=True):
+            here = data.sel(quantity=quantity)
+            down, up = here["down"].mean("trial"), here["up"].mean("trial")
+            axis.stairs(
+                up, edges, baseline=-down, fill=True, color=COLOURS[0], alpha=0.18, label="forecast, after"
+            )
+            wide = float(here["extrapolated_error"].mean())
+            axis.axhspan(
+                -wide,
+                wide,
+                facecolor="none",
+                edgecolor="0.5",
+                hatch="////",
+                linewidth=0,
+                label="forecast, extrapolated",
+            )
+            for k, (name, marker) in enumerate((("before", "o"), ("after", "s"))):
+                values = here[name]
+                mean, ends = values.mean("trial"), values.quantile([1 / 6, 5 / 6], "trial")
+                sides = [mean - ends[0], ends[1] - mean]
+                axis.errorbar(
+                    middle + 0.12 * (2 * k - 1), mean, yerr=sides, color=COLOURS[1 - k], marker=marker,
+                    markersize=4, linestyle="none", linewidth=1.1, label=name,
+                )  # fmt: skip
+            axis.axhline(0.0, color="0.3", linewidth=0.6)
+            axis.set(xlim=(edges[0], edges[-1]), xlabel="$i$ [mag]", ylabel=label)
+            axis.ticklabel_format(axis="y", style="sci", scilimits=(0, 0), useMathText=True)
+        handles, names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+        figure.suptitle(f"{data.attrs['psf']}, stacks of {data.attrs['n_stars']} stars", fontsize=9.5)
+    return figure

@@ -19,6 +19,7 @@ from porrima.integrals import integrate, separation_share
 from porrima.moments import N_MOMENTS
 from porrima.photometry import magnitude_on_track
 from porrima.prediction import predict
+from porrima.screen import kept_share, screen_of
 from porrima.singles import ANGLES, added_shapes, pair_moments
 
 if TYPE_CHECKING:
@@ -147,7 +148,7 @@ def size_distribution(
     Parameters
     ----------
     population : Population
-        Stars of equal weight, their companions' law and the cut.
+        Stars of equal weight, their companions' law, the cut and the selection.
     response : Response
         Of the PSF and estimator.
     n_stars : int
@@ -219,32 +220,55 @@ def pair_density(
     density : PairDensity
         Dimensionless.
     """
-    law, tracks = population.law, population.tracks
+    law, screen = population.law, screen_of(population)
     scale = population.scale(None if binary_fraction is None else np.array([binary_fraction]))[0]
-    pair = np.minimum(1.0, scale * law.multiplicity_fraction)
-    pair = pair / np.sum(1.0 - pair * (1.0 - integrals.unresolved))
+    pair, number = np.minimum(1.0, scale * law.multiplicity_fraction), population.abundance
+    alone = 1.0 if integrals.single_kept is None else integrals.single_kept
+    pair = number * pair / np.sum(number * (alone - pair * integrals.lost))
     place = np.log10(population.cut * population.stars.distance) - law.log_a
     kinds, which = np.unique(
         np.stack([law.log_a_sigma, law.log_a_max - law.log_a], axis=1).round(12), axis=0, return_inverse=True
     )
     first = math.floor(place.min())
     n_place = 2 + math.ceil((place.max() - first) / _PLACE_STEP)
-    count, total = np.zeros((len(kinds), n_place, _Y_CELLS)), np.zeros((2, _Y_CELLS))
-    _count_pairs(
-        tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index, tracks.weight,
-        population.stars.mass, law.mass_ratio_min, law.mass_ratio_exponent, law.mass_ratio,
-        which.ravel(), (place - first) / _PLACE_STEP, pair, count, total,
-    )  # fmt: skip
     edge = np.linspace(-_R_DECADES, 0.0, _R_CELLS + 1)
-    at = first + _PLACE_STEP * np.arange(n_place)
-    share = np.zeros((_Y_CELLS, _R_CELLS))
-    for (sigma, beyond), stars in zip(kinds, count, strict=True):
+    at, inside = first + _PLACE_STEP * np.arange(n_place), []
+    for sigma, beyond in kinds:
         below = separation_share(float(sigma), float(beyond), population.projection, at[:, None] + edge)
         below[:, 0] = 0.0
-        share += stars.T @ np.diff(below, axis=1)
+        inside.append(np.diff(below, axis=1))
     middle = 10.0 ** (_Y_DECADES * ((np.arange(_Y_CELLS) + 0.5) / _Y_CELLS - 1))
+    square, total = 10.0 ** (edge[1:] + edge[:-1]), np.zeros((2, _Y_CELLS))
+    share = np.zeros((_Y_CELLS, _R_CELLS))
+    for node in range(1 if screen.is_empty else screen.score.shape[1]):
+        some = np.arange(pair.size) if screen.is_empty else np.flatnonzero(screen.slice == node)
+        count = np.zeros((len(kinds), n_place, _Y_CELLS))
+        _count_rows(population, some, which.ravel(), (place - first) / _PLACE_STEP, pair, count, total)
+        here = np.zeros_like(share)
+        for stars, cells in zip(count, inside, strict=True):
+            here += stars.T @ cells
+        share += here if screen.is_empty else here * kept_share(screen, node, middle, square)
     four_y = np.divide(total[1], total[0], out=middle, where=total[0] > 0)
-    return PairDensity(four_y=four_y, square=10.0 ** (edge[1:] + edge[:-1]), share=share)
+    return PairDensity(four_y=four_y, square=square, share=share)
+
+
+def _count_rows(
+    population: Population,
+    some: IntArray,
+    kind: IntArray,
+    place: FloatArray,
+    pair: FloatArray,
+    count: FloatArray,
+    total: FloatArray,
+) -> None:
+    """Count the pairs of some rows of a population, see `_count_pairs`."""
+    law, tracks = population.law, population.tracks
+    columns = (
+        tracks.index, tracks.weight, population.stars.mass, law.mass_ratio_min, law.mass_ratio_max,
+        law.mass_ratio_exponent, law.mass_ratio, kind, place, pair,
+    )  # fmt: skip
+    mine = [column[some] for column in columns]
+    _count_pairs(tracks.magnitude, tracks.log_mass_min, tracks.dark_below, *mine, count, total)
 
 
 @njit(cache=True)
@@ -256,6 +280,7 @@ def _count_pairs(  # type: ignore[no-untyped-def]
     weight,
     mass,
     q_min,
+    q_max,
     exponent,
     given,
     kind,
@@ -272,8 +297,10 @@ def _count_pairs(  # type: ignore[no-untyped-def]
             grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
         )
         g = exponent[s] + 1.0
-        first = min(max(dark_below / mass[s], q_min[s]), 1.0)
-        norm = (1.0 - q_min[s] ** g) / g if abs(g) > 1e-9 else -math.log(q_min[s])
+        first = min(max(dark_below / mass[s], q_min[s]), q_max[s])
+        norm = (q_max[s] ** g - q_min[s] ** g) / g if abs(g) > 1e-9 else math.log(q_max[s] / q_min[s])
+        last = math.log(q_max[s])
+        span = last - math.log(first)
         one = not math.isnan(given[s])
         if one and given[s] * mass[s] < dark_below:
             continue
@@ -281,8 +308,8 @@ def _count_pairs(  # type: ignore[no-untyped-def]
         low = int(place[s])
         upper = place[s] - low
         for k in range(steps):
-            log_q = math.log(given[s]) if one else math.log(first) * (1.0 - (k + 0.5) / steps)
-            share = pair[s] if one else pair[s] * math.exp(g * log_q) / norm * -math.log(first) / steps
+            log_q = math.log(given[s]) if one else last - span * (1.0 - (k + 0.5) / steps)
+            share = pair[s] if one else pair[s] * math.exp(g * log_q) / norm * span / steps
             magnitude = magnitude_on_track(
                 grid, log_mass_min, log_mass + log_q * to_log,
                 i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],

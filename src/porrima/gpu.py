@@ -20,9 +20,8 @@ from porrima.moments import N_MOMENTS
 from porrima.pairs import (
     BASE,
     CUT,
-    FLUX,
+    DIMMING,
     FRACTION,
-    LAW,
     MASS,
     MOST_TRIES,
     Q_FLAT,
@@ -30,6 +29,7 @@ from porrima.pairs import (
     Q_START,
     SIGMA,
     TRUNCATION,
+    W0,
     W1,
     W2,
     W3,
@@ -41,6 +41,7 @@ from porrima.pairs import (
     direction,
     flux_ratio,
     is_too_many,
+    light,
     phase_word,
     place_on_track,
     primary,
@@ -204,27 +205,33 @@ def _draw_pair(tables, scale, key_low, key_high, low, high, pair):  # type: igno
     """Number of the star, flux ratio and offset of one pair; whether its star may have one, and whether it is kept."""
     words = random_words(key_low, key_high, low, high, pair)
     star = primary(words[0], tables.alias)
-    law = bits(tables.star[star, LAW])
-    deviate = normal(axis_argument(words[2], tables.law[law, TRUNCATION]))
+    deviate = normal(axis_argument(words[2], tables.star[star, TRUNCATION]))
     phase = uint32(0) if tables.isotropic else phase_word(key_low, key_high, low, high, pair)
-    log_a = tables.star[star, A] + tables.law[law, SIGMA] * deviate
+    log_a = tables.star[star, A] + tables.star[star, SIGMA] * deviate
     r = separation(tables.isotropic, log_a, words[3], phase)
     cosine, sine = direction(words[3])
     mass = companion_mass(
         words[1],
         tables.star[star, MASS],
-        tables.law[law, Q_SLOPE],
-        tables.law[law, Q_START],
-        tables.law[law, Q_FLAT],
+        tables.star[star, Q_SLOPE],
+        tables.star[star, Q_START],
+        tables.star[star, Q_FLAT],
     )
     k, t = place_on_track(mass, tables.grid_start, tables.grid_per_unit, tables.n_grid)
-    row, track = bits(tables.star[star, BASE]) + k, tables.track
-    f = flux_ratio(
-        tables.star[star, W1], tables.star[star, W2], tables.star[star, W3], t,
-        track[row, 0], track[row, 1], track[row, 2], track[row, 3],
-        track[row, 4], track[row, 5], track[row, 6], track[row, 7],
-        tables.star[star, FLUX], mass < tables.log_dark,
-    )  # fmt: skip
+    row = bits(tables.star[star, BASE]) + k
+    left, right = _light(tables, star, row, 0), _light(tables, star, row, 4)
+    f = flux_ratio(left, right, t, mass < tables.log_dark)
     is_capped = scale * tables.largest_fraction > 1.0
-    is_valid = not (is_capped and is_too_many(words[1], words[2], scale, tables.law[law, FRACTION]))
+    is_valid = not (is_capped and is_too_many(words[1], words[2], scale, tables.star[star, FRACTION]))
     return star, f, r * cosine, r * sine, is_valid, is_valid and r < float32(CUT)
+
+
+@_step
+def _light(tables, star, row, column):  # type: ignore[no-untyped-def]
+    """Light on the tracks of a star, from four columns of a row."""
+    own, track = tables.star, tables.track
+    return light(
+        own[star, W0], own[star, W1], own[star, W2], own[star, W3],
+        track[row, column], track[row, column + 1], track[row, column + 2], track[row, column + 3],
+        own[star, DIMMING],
+    )  # fmt: skip

@@ -17,19 +17,28 @@ from numba import njit, prange
 from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr, logsumexp
 
+from porrima.kept import joint_powers
 from porrima.moments import ORDER
 from porrima.orbits import projection_nodes
 from porrima.photometry import magnitude_on_track
+from porrima.screen import screen_of
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
+    from porrima.companions import CompanionLaw
     from porrima.orbits import Projection
     from porrima.systems import Population
 
     FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
 
-__all__ = ["EVEN", "PRODUCTS", "PairIntegrals", "coefficient_polynomial", "integrate", "separation_moments"]
+__all__ = [
+    "EVEN", "PRODUCTS", "PairIntegrals", "coefficient_polynomial", "integrate", "separation_moments",
+    "separations_below", "starts_of_mass_ratios",
+]  # fmt: skip
 
 EVEN = tuple(range(2, ORDER + 1, 2))
 """Orders of the moments that do not vanish in the mean."""
@@ -54,17 +63,73 @@ class PairIntegrals:
         :math:`E[(4y)^j]` for j = 0 to 8, dimensionless: by the rule in use, and by one of half its nodes.
     separation : (2, n, 9) float array
         :math:`E[(r/r_{cut})^{2k};\ r < r_{cut}]` for k = 0 to 8, dimensionless, likewise.
+    joint : (2, n, 9, 9) float array or None
+        :math:`E[(4y)^j (r/r_{cut})^{2k};\ \mathrm{kept}]` of the pairs that a selection keeps; without one it is the
+        product of the two others.  Dimensionless.
+    single_kept : (n,) float array or None
+        Probability that a star, if single, is kept, in [0, 1]; None without a selection.
     """
 
     cut: float
     coefficient: FloatArray
     separation: FloatArray
+    joint: FloatArray | None = None
+    single_kept: FloatArray | None = None
 
     @property
     def unresolved(self) -> FloatArray:
         """Probability that the pair is closer than the cut, (n,), in [0, 1]."""
         probability: FloatArray = self.separation[0, :, 0]
         return probability
+
+    @property
+    def kept(self) -> FloatArray:
+        """Probability that the pair stays in the sample, (n,), in [0, 1]."""
+        return self.unresolved if self.joint is None else self.joint[0, :, 0, 0]
+
+    @property
+    def lost(self) -> FloatArray:
+        """Probability that the star stays when it is single minus that when it is a pair, (n,)."""
+        return (1.0 if self.single_kept is None else self.single_kept) - self.kept
+
+    def power(self, j: int, k: int) -> FloatArray:
+        """Expectation of one joint power over the pairs that stay.
+
+        Parameters
+        ----------
+        j, k : int
+            Of 4 y and of the square of the separation over the cut, 0 to 8.
+
+        Returns
+        -------
+        power : (n,) float array
+            Dimensionless.
+        """
+        if self.joint is not None:
+            return self.joint[0, :, j, k]
+        return self.coefficient[0, :, j] * self.separation[0, :, k]
+
+    def sum_of_powers(self, weight: FloatArray, star: IntArray, rule: int) -> FloatArray:
+        """Sum of all joint powers over some stars.
+
+        Parameters
+        ----------
+        weight : (m,) float array
+            Of each, dimensionless.
+        star : (m,) int array
+            Their numbers, dimensionless.
+        rule : {0, 1}
+            The rule in use or the coarser one.
+
+        Returns
+        -------
+        powers : (9, 9) float array
+            Dimensionless.
+        """
+        if self.joint is not None:
+            return np.asarray(np.tensordot(weight, self.joint[rule, star], axes=1))
+        weighted = weight[:, None] * self.coefficient[rule, star]
+        return np.asarray(weighted.T @ self.separation[rule, star])
 
     @property
     def mean(self) -> FloatArray:
@@ -78,6 +143,9 @@ class PairIntegrals:
 
     def _of(self, terms: list[tuple[int, FloatArray]]) -> FloatArray:
         """Expectation of some polynomials in 4 y, each times a power of r."""
+        joint = self.joint
+        if joint is not None:
+            return np.stack([(joint[0, :, :, n // 2] @ c) * self.cut**n for n, c in terms], axis=1)
         columns = [(self.coefficient[0] @ c) * self.separation[0, :, n // 2] * self.cut**n for n, c in terms]
         return np.stack(columns, axis=1)
 
@@ -120,13 +188,15 @@ def coefficient_polynomial(n: int, m: int = 0) -> FloatArray:
     return out
 
 
-def integrate(population: Population) -> PairIntegrals:
+def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegrals:
     r"""Expectations over companions by quadrature: mass ratio by Simpson's rule, orientation by Gauss's.
 
     Parameters
     ----------
     population : Population
-        Stars, their companions' law and the cut.
+        Stars, their companions' law, the cut and the selection.
+    intervals : int
+        Of Simpson's rule, a multiple of four (count).
 
     Returns
     -------
@@ -136,13 +206,61 @@ def integrate(population: Population) -> PairIntegrals:
     Notes
     -----
     Simpson's rule has 128 intervals in the logarithm of the mass ratio, along which tracks are piecewise linear.
-    The separation is exact for one orientation, see `separation_moments`.
+    The separation is exact for one orientation, see `separation_moments`.  With a selection mass ratio and separation
+    are integrated together, see `kept.joint_powers`; the coarser rule has half the nodes of the selection, too.
     """
+    screen = screen_of(population)
+    joint = None
+    if not screen.is_empty:
+        joint = np.stack(
+            [
+                joint_powers(
+                    population, screen, rule, intervals // (1 + rule), starts_of_mass_ratios(population.law),
+                    separations_below(population, rule),
+                )
+                for rule in (0, 1)
+            ]
+        )  # fmt: skip
     return PairIntegrals(
         cut=population.cut,
-        coefficient=coefficient_moments(population),
+        coefficient=coefficient_moments(population, intervals),
         separation=separation_moments(population),
+        joint=joint,
+        single_kept=None if screen.is_empty else 1.0 - screen.single,
     )
+
+
+def separations_below(population: Population, rule: int) -> Callable[[IntArray, FloatArray], FloatArray]:
+    """Partial moments of the separation of some rows below some fractions of the cut.
+
+    Parameters
+    ----------
+    population : Population
+        Of n rows.
+    rule : {0, 1}
+        The rule in use or the coarser one.
+
+    Returns
+    -------
+    moments : callable
+        From the numbers (m,) of rows and fractions (k,) in dex to logarithms (m, k, 9) of the even moments of the
+        separation below each fraction, over it (dimensionless).
+    """
+    law = population.law
+    place = np.log10(population.cut * population.stars.distance) - law.log_a
+    scatter, beyond = law.log_a_sigma.round(12), (law.log_a_max - law.log_a).round(12)
+
+    def found(some: IntArray, fraction: FloatArray) -> FloatArray:
+        out = np.empty((some.size, fraction.size, ORDER + 1))
+        kinds, which = np.unique(np.stack([scatter[some], beyond[some]], axis=1), axis=0, return_inverse=True)
+        for number, (sigma, widest) in enumerate(kinds):
+            mine = which.ravel() == number
+            at = (place[some[mine], None] + fraction).ravel()
+            log_moments = _log_moments(float(sigma), float(widest), population.projection, at, rule)
+            out[mine] = log_moments.reshape(-1, fraction.size, ORDER + 1)
+        return out
+
+    return found
 
 
 def coefficient_moments(population: Population, intervals: int = _INTERVALS) -> FloatArray:
@@ -161,12 +279,37 @@ def coefficient_moments(population: Population, intervals: int = _INTERVALS) -> 
         Powers 0 to 8, dimensionless; by all nodes, and by every other.
     """
     law, tracks = population.law, population.tracks
-    moments = np.empty((2, len(population.stars), ORDER + 1))
+    columns = law.mass_ratio_min, law.mass_ratio_max, law.mass_ratio_exponent, law.mass_ratio
+    start = starts_of_mass_ratios(law)
+    moments = np.empty((2, start.size, ORDER + 1))
     _coefficients(
-        tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index, tracks.weight,
-        population.stars.mass, law.mass_ratio_min, law.mass_ratio_exponent, law.mass_ratio, intervals, moments,
+        tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index[start], tracks.weight[start],
+        population.stars.mass[start], *(column[start] for column in columns), intervals, moments,
     )  # fmt: skip
-    return moments
+    return (
+        moments
+        if start.size == law.star.size
+        else np.repeat(moments, np.diff(start, append=law.star.size), axis=1)
+    )
+
+
+def starts_of_mass_ratios(law: CompanionLaw) -> NDArray[np.int64]:
+    """First of each run of classes that share star and mass ratios, and may differ in their orbits.
+
+    Parameters
+    ----------
+    law : CompanionLaw
+        Of m classes.
+
+    Returns
+    -------
+    start : (k,) int array
+        Numbers of rows, ascending from 0 (dimensionless).
+    """
+    is_new = np.diff(law.star, prepend=-1) != 0
+    for column in (law.mass_ratio_min, law.mass_ratio_max, law.mass_ratio_exponent):
+        is_new |= np.diff(column, prepend=np.nan) != 0
+    return np.flatnonzero(is_new)
 
 
 @njit(inline="always")
@@ -180,7 +323,7 @@ def _add_powers(weight, flux_ratio, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, parallel=True)
 def _coefficients(  # type: ignore[no-untyped-def]
-    grid, log_mass_min, dark_below, index, weight, mass, q_min, exponent, given, intervals, out
+    grid, log_mass_min, dark_below, index, weight, mass, q_min, q_max, exponent, given, intervals, out
 ):
     """E[(4y)^j] of each star by Simpson's rule in ln q, with all nodes and with every other one."""
     to_log, to_exponent = 1.0 / math.log(10.0), -0.4 * math.log(10.0)
@@ -192,18 +335,19 @@ def _coefficients(  # type: ignore[no-untyped-def]
         out[:, s, :] = 0.0
         out[:, s, 0] = 1.0
         g = exponent[s] + 1.0
-        first = min(max(dark_below / mass[s], q_min[s]), 1.0)  # below it companions are dark
-        span, nodes = -math.log(first), intervals + 1
+        first = min(max(dark_below / mass[s], q_min[s]), q_max[s])  # below it companions are dark
+        last, nodes = math.log(q_max[s]), intervals + 1
+        span = last - math.log(first)
         if not math.isnan(given[s]):
-            nodes, span = 1, -math.log(given[s])
+            nodes, last, span = 1, 0.0, -math.log(given[s])
             if given[s] * mass[s] < dark_below:
                 continue
         elif span == 0.0:
             continue
-        norm = (1.0 - q_min[s] ** g) / g if abs(g) > 1e-9 else -math.log(q_min[s])
+        norm = (q_max[s] ** g - q_min[s] ** g) / g if abs(g) > 1e-9 else math.log(q_max[s] / q_min[s])
         h = span / intervals
         for k in range(nodes):
-            log_q = h * k - span
+            log_q = h * k - span + last
             magnitude = magnitude_on_track(
                 grid, log_mass_min, log_mass + log_q * to_log,
                 i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],

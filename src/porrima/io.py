@@ -121,7 +121,7 @@ def read_galaxies(path: Path, index: float, mean_e2: float, smallest: float = 0.
     return galaxies.larger_than(smallest**2 * r2_of_half_light(index)) if smallest > 0 else galaxies
 
 
-def write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:
+def write_rows(rows: Sequence[dict[str, Any]], path: Path, made_with: dict[str, Any] | None = None) -> None:
     """Rows of equal keys as a table (ECSV).
 
     Parameters
@@ -130,6 +130,8 @@ def write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:
         As `summary.rows` gives them.
     path : Path
         The file, replaced if it exists.
+    made_with : dict, optional
+        Models, options and versions, for the head of the file.
 
     Returns
     -------
@@ -138,7 +140,7 @@ def write_rows(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """
     from astropy.table import Table  # noqa: PLC0415  (slow to import)
 
-    table = Table(rows=list(rows))
+    table = Table(rows=list(rows), meta=made_with)
     write_table(table, path)
 
 

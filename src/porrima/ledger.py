@@ -80,7 +80,7 @@ def _place(one: MagnitudeBin) -> dict[str, Any]:
 
 def _bin_row(one: MagnitudeBin) -> dict[str, Any]:
     low, high = one.uncertainty.interval("eta")
-    moments = one.uncertainty.prediction.population
+    moments, models = one.uncertainty.prediction.population, one.uncertainty.models
     source, change = one.uncertainty.ranking()[0]
     return _place(one) | {
         "n_catalog_stars": one.n_catalog_stars,
@@ -89,6 +89,8 @@ def _bin_row(one: MagnitudeBin) -> dict[str, Any]:
         "eta": float(one.uncertainty.prediction.eta[0]),
         "eta_low": low,
         "eta_high": high,
+        "eta_models_low": min((float(v[0]) for v in models.values()), default=None),
+        "eta_models_high": max((float(v[0]) for v in models.values()), default=None),
         "largest_source": source,
         "largest_change": change,
     }

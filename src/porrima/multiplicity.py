@@ -1,14 +1,21 @@
-"""How many stars have a companion, how massive it is, how wide its orbit: one object per published model."""
+"""How many stars have a companion, how massive it is, how wide its orbit: models by name.
+
+`DucheneKraus2013`, what KCM16 use, is here; those of other papers are in `published` and `moe`.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from porrima.companions import CompanionLaw, MultiplicityModel, RowErrors, multiplicity_scale
+from porrima.eccentricity import Eccentricity, check_eccentricity, eccentric
+from porrima.moe import MoeDiStefano2017
 from porrima.photometry import check_masses
+from porrima.published import Offner2023, Raghavan2010, SusemiehlMeyer2022, Winters2019
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,74 +24,15 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["MULTIPLICITY", "CompanionLaw", "DucheneKraus2013", "MultiplicityModel", "multiplicity_scale"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CompanionLaw:
-    r"""Statistics of the companion of each of n stars.
-
-    Parameters
-    ----------
-    multiplicity_fraction : (n,) float array
-        Probability that the star has a companion, in [0, 1].
-    mass_ratio_exponent : (n,) float array
-        :math:`\gamma` of :math:`dN/dq \propto q^\gamma`, dimensionless.
-    mass_ratio_min : (n,) float array
-        Least mass ratio, in (0, 1).
-    log_a : (n,) float array
-        Mean of log10 of the semi-major axis in au, before any truncation.
-    log_a_sigma : (n,) float array
-        Its standard deviation, in dex.
-    log_a_max : (n,) float array
-        log10 of the largest semi-major axis in au; infinite where there is none.
-    mass_ratio : (n,) float array
-        The mass ratio itself where a catalogue gives it, in (0, 1]; NaN where it is drawn.
-    """
-
-    multiplicity_fraction: FloatArray
-    mass_ratio_exponent: FloatArray
-    mass_ratio_min: FloatArray
-    log_a: FloatArray
-    log_a_sigma: FloatArray
-    log_a_max: FloatArray
-    mass_ratio: FloatArray
-
-    def with_given(self, mass_ratio: FloatArray) -> CompanionLaw:
-        """The law with the pairs that a catalogue has made: their mass ratios fixed, its single stars single.
-
-        Parameters
-        ----------
-        mass_ratio : (n,) float array
-            In [0, 1], 0 for a single star, NaN where the law decides.
-
-        Returns
-        -------
-        law : CompanionLaw
-            Orbits as before, in log10 au.
-        """
-        return replace(
-            self,
-            multiplicity_fraction=np.where(
-                np.isnan(mass_ratio), self.multiplicity_fraction, (mass_ratio > 0).astype(float)
-            ),
-            mass_ratio=np.where(mass_ratio > 0, mass_ratio, np.nan),
-        )
-
-
-class MultiplicityModel(Protocol):
-    """A published account of stellar multiplicity."""
-
-    @property
-    def mass_range(self) -> tuple[float, float]:
-        """Least and largest mass of a primary, in M_sun."""
-
-    @property
-    def projection(self) -> Projection:
-        """How orbits are turned to the line of sight."""
-
-    def companions(self, mass: FloatArray) -> CompanionLaw:
-        """Companion statistics of primaries, mass in M_sun, (n,) float array."""
+__all__ = [
+    "COMPILATIONS",
+    "MULTIPLICITY",
+    "PAPERS",
+    "CompanionLaw",
+    "DucheneKraus2013",
+    "MultiplicityModel",
+    "multiplicity_scale",
+]  # fmt: skip
 
 
 class _Row(NamedTuple):
@@ -101,6 +49,16 @@ class _Row(NamedTuple):
 _VERY_LOW = _Row(0.0, 0.1, 0.22, 4.2, 4.5, 0.5)
 _LOW = _Row(0.1, 0.5, 0.26, 0.4, 5.3, 1.3)
 _SOLAR = _Row(0.7, 1.3, 0.44, 0.3, 45.0, 2.3)
+
+
+ROW_ERRORS = (
+    RowErrors((0.04, 0.06), (1.0, 1.0), (0.05, 0.05), (0.25, 0.25)),
+    RowErrors((0.03, 0.03), (0.2, 0.2), (0.30, 0.30), (0.25, 0.25)),
+    RowErrors((0.02, 0.02), (0.1, 0.1), (0.05, 0.05), (0.10, 0.10)),
+)
+"""Below 0.1, 0.1-0.5 and about 1 M_sun.  Multiplicity fractions and exponents as published (Duchene & Kraus 2013);
+they give no error of mean separations and widths: half the distance to the later compilations is taken (Winters et
+al. 2019: 20 au; Susemiehl & Meyer 2022: 27 and 50 au; Offner et al. 2023: 4, 25 and 40 au and their widths)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,6 +79,8 @@ class DucheneKraus2013:
         and by up to 12 % where orbits are truncated.
     mass_ratio_min : float
         Least mass ratio, in (0, 1).
+    eccentricity : {"circular", "uniform", "thermal", "mds17"}
+        Of the orbits; KCM16 take circles.
 
     Raises
     ------
@@ -146,6 +106,7 @@ class DucheneKraus2013:
     scatter_scale: float = 1.0
     projection: Projection = "isotropic"
     mass_ratio_min: float = 0.1
+    eccentricity: Eccentricity = "circular"
 
     def __post_init__(self) -> None:
         if self.gap_rule not in ("lower", "solar"):
@@ -158,11 +119,30 @@ class DucheneKraus2013:
             raise ValueError(f"scatter_scale must be positive and finite, got {self.scatter_scale}")
         if not 0 < self.mass_ratio_min < 1:
             raise ValueError(f"mass_ratio_min must be in (0, 1), got {self.mass_ratio_min}")
+        check_eccentricity(self.eccentricity)
 
     @property
     def mass_range(self) -> tuple[float, float]:
         """Least and largest mass of a primary, in M_sun; KCM16 give no widths above 1.5."""
         return (0.0, 1.5)
+
+    @property
+    def row_errors(self) -> tuple[RowErrors, ...]:
+        """Errors of each row: `ROW_ERRORS`, those of the scatter on its scale."""
+        scale = self.scatter_scale
+        return tuple(
+            row._replace(sigma_log_period=(scale * row.sigma_log_period[0], scale * row.sigma_log_period[1]))
+            for row in ROW_ERRORS
+        )
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """The gap rule and the projection, each the other way."""
+        projections = {"isotropic": "inclination-uniform", "inclination-uniform": "isotropic"}
+        return {
+            "gap_rule": {"lower": "solar", "solar": "lower"}[self.gap_rule],
+            "projection": projections[self.projection],
+        }
 
     def rows(self, mass: FloatArray) -> NDArray[np.int64]:
         """Row of the table that each primary takes, the masses between rows by the gap rule.
@@ -180,18 +160,20 @@ class DucheneKraus2013:
         solar_from = _SOLAR.mass_lo if self.gap_rule == "lower" else _LOW.mass_hi
         return np.where(mass < _VERY_LOW.mass_hi, 0, np.where(mass < solar_from, 1, 2))
 
-    def companions(self, mass: FloatArray) -> CompanionLaw:
+    def companions(self, mass: FloatArray, metallicity: FloatArray | None = None) -> CompanionLaw:
         r"""Companion statistics of each primary.
 
         Parameters
         ----------
         mass : (n,) float array
             Mass of the primary, in M_sun.
+        metallicity : (n,) float array, optional
+            [M/H], in dex; without effect.
 
         Returns
         -------
         law : CompanionLaw
-            Arrays of n stars: axes in log10 au, scatter in dex.
+            One class for each star, or one for each node of the eccentricity: axes in log10 au, scatter in dex.
 
         Raises
         ------
@@ -202,68 +184,45 @@ class DucheneKraus2013:
         table = np.array([_VERY_LOW, _LOW, _SOLAR])[self.rows(mass)]
         log_a = np.log10(table[:, 4])
         beyond = math.inf if self.a_max_factor is None else math.log10(self.a_max_factor)
-        return CompanionLaw(
+        law = CompanionLaw(
+            star=np.arange(mass.size),
+            share=np.ones(mass.shape),
             multiplicity_fraction=table[:, 2],
             mass_ratio_exponent=table[:, 3],
             mass_ratio_min=np.full(mass.shape, self.mass_ratio_min),
+            mass_ratio_max=np.ones(mass.shape),
             log_a=log_a,
             log_a_sigma=2.0 / 3.0 * self.scatter_scale * table[:, 5],
             log_a_max=log_a + beyond,
             mass_ratio=np.full(mass.shape, np.nan),
         )
+        return eccentric(law, mass, self.eccentricity)
 
 
-MULTIPLICITY: dict[str, DucheneKraus2013] = {
+MULTIPLICITY: dict[str, MultiplicityModel] = {
     "dk13": DucheneKraus2013(),
     "dk13-kcm16": DucheneKraus2013(gap_rule="solar", a_max_factor=2.5),
+    "offner23": Offner2023(),
+    "raghavan10": Raghavan2010(),
+    "winters19": Winters2019(),
+    "sm22": SusemiehlMeyer2022(),
+    "mds17": MoeDiStefano2017(),
+    "modern": Offner2023(gap_rule="interpolated", eccentricity="mds17", metallicity="moe19"),
 }
-"""Models by name; ``dk13-kcm16`` is the variant that reproduces the magnitude dependence of KCM16."""
+"""Models by name; ``dk13-kcm16`` is the variant that reproduces the magnitude dependence of KCM16, ``modern`` what is
+known today: the figures of Offner et al. (2023) without steps, eccentric orbits, close pairs by metallicity."""
 
+PAPERS = {
+    "dk13": "Duchene & Kraus 2013",
+    "dk13-kcm16": "Duchene & Kraus 2013",
+    "offner23": "Offner et al. 2023",
+    "raghavan10": "Raghavan et al. 2010",
+    "winters19": "Winters et al. 2019",
+    "sm22": "Susemiehl & Meyer 2022",
+    "mds17": "Moe & Di Stefano 2017",
+    "modern": "Offner et al. 2023, Moe & Di Stefano 2017, Moe et al. 2019",
+}
+"""What a model asks to be cited, by its name."""
 
-def multiplicity_scale(multiplicity_fraction: FloatArray, binary_fraction: FloatArray) -> FloatArray:
-    r"""Factor s that scales every star's multiplicity fraction so that a population has a binary fraction F.
-
-    Parameters
-    ----------
-    multiplicity_fraction : (n,) float array
-        Of each star as the model gives it, in [0, 1].
-    binary_fraction : (k,) float array
-        Wanted mean over the stars, in [0, 1].
-
-    Returns
-    -------
-    scale : (k,) float array
-        Dimensionless.
-
-    Raises
-    ------
-    ValueError
-        If a binary fraction lies outside [0, 1] or beyond what stars with any companions can give.
-
-    Notes
-    -----
-    Solves :math:`\frac{1}{n} \sum_i \min(1, s\, MF_i) = F` exactly: the left side is linear in s between
-    the values :math:`1/MF_i`.  The capping at 1 changes the population at large F (KCM16 Sect. 5.1).
-
-    References
-    ----------
-    KCM16
-    """
-    wanted = np.asarray(binary_fraction, dtype=float)
-    if np.any((wanted < 0) | (wanted > 1) | ~np.isfinite(wanted)):
-        raise ValueError(
-            f"binary_fraction must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}"
-        )
-    ascending = np.sort(multiplicity_fraction)
-    values, first = np.unique(ascending, return_index=True)
-    values, first = values[values > 0], first[values > 0]
-    sum_below = np.concatenate([[0.0], np.cumsum(ascending)])[first]
-    reached = np.concatenate(
-        [[0.0], ((sum_below / values + (ascending.size - first)) / ascending.size)[::-1]]
-    )
-    if np.any(wanted > reached[-1] * (1 + 1e-12)):
-        raise ValueError(
-            f"binary_fraction must be at most {reached[-1]:.6g} for these stars, got {wanted.max()}"
-        )
-    scale: FloatArray = np.interp(wanted, reached, np.concatenate([[0.0], 1.0 / values[::-1]]))
-    return scale
+COMPILATIONS = ("dk13", "offner23", "sm22", "modern")
+"""Those that hold for the masses of nearly all stars: what they differ by is the spread between models."""

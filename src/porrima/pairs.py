@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CUT", "MOST_TRIES", "Tables", "add_moments", "axis_argument", "companion_mass", "direction", "flux_ratio",
-    "is_too_many", "phase_word", "place_on_track", "primary", "random_words", "separation", "single_star",
+    "is_too_many", "light", "phase_word", "place_on_track", "primary", "random_words", "separation", "single_star",
     "tables_of",
 ]  # fmt: skip
 
-WIDTH = 8
-"""Columns of every table of rows."""
+WIDTH = 16
+"""Columns of `Tables.star`: a row is one line of a CPU's cache."""
 
-A, MASS, FLUX, W1, W2, W3, BASE, LAW = range(WIDTH)
-"""Columns of `Tables.star`."""
+A, SIGMA, TRUNCATION, MASS, Q_SLOPE, Q_START, Q_FLAT, BASE, DIMMING, FRACTION = range(10)
+"""Columns of `Tables.star`; two stay free."""
 
-SIGMA, TRUNCATION, Q_SLOPE, Q_START, Q_FLAT, FRACTION = range(6)
-"""Columns of `Tables.law`."""
+W0, W1, W2, W3 = range(12, WIDTH)
+"""Its last columns, the weights of the four tracks of a star."""
 
 CUT = 4096.0
 """The cut in the unit of length: eighth powers of 1e-7 to 1 cut are then normal float32.  Where they are not, a CPU
@@ -51,22 +51,24 @@ _WIDEST = 8 * CUT
 _SMALLEST = -6.0
 """Binary logarithm of the least semi-major axis, 4e-6 of the cut."""
 
+_MAGNITUDE_TO_LOG2 = -0.4 * math.log2(10.0)
+
 MOST_TRIES = 10_000
 """Pairs drawn for each star of a stack before it is given up: all are resolved."""
 
 
 class Tables(NamedTuple):
-    """A population as the compiled loops read it: everything that one pair needs stands in three rows of 32 bytes.
+    """A population as the compiled loops read it: everything that one pair needs stands in two rows.
 
-    A star has the mean of log2(a/d), log2 of the mass that the mass ratio multiplies (the primary's, or
-    the companion's where it is given), log2 of the primary's flux, the weights of the second to fourth of its tracks,
-    and the first row of its group of tracks and that of its law (as bits).  A law has the scatter of log2 a, the
-    cumulative probability of the longest axis, the three numbers of the mass ratio (see `companion_mass`), the
-    multiplicity fraction.  A track row has log2 of the flux on the four tracks of a group at one mass and at the next.
+    A star has a row for each class of its companions: the mean of log2(a/d), the scatter of log2 a and the cumulative
+    probability of the longest axis; log2 of the mass that the mass ratio multiplies (the primary's times the largest
+    mass ratio, or the companion's where it is given), and the three numbers of the mass ratio (see `companion_mass`);
+    the first row of its group of tracks (as bits), a fourth of log2 of 1 over the primary's flux, the multiplicity
+    fraction; the weights of its four tracks.  A track row has log2 of the flux on the four tracks of a group at one
+    mass and at the next.
     """
 
-    star: NDArray[np.float32]  # (n, 8)
-    law: NDArray[np.float32]  # (n_law, 8)
+    star: NDArray[np.float32]  # (n, 16)
     track: NDArray[np.float32]  # (n_group * n_grid, 8)
     n_grid: int  # rows of each group, on a uniform grid of log2 mass
     grid_start: np.float32
@@ -75,7 +77,10 @@ class Tables(NamedTuple):
     isotropic: bool
     largest_fraction: float
     weight: NDArray[np.float32]  # (n,) of each star in a stack; no rows where all count alike
-    alias: NDArray[np.float32]  # (n, 2) alias table of the multiplicity fractions: see `alias_table`
+    abundance: NDArray[
+        np.float32
+    ]  # (n,) of each row among the stars, over the largest; none where all are alike
+    alias: NDArray[np.float32]  # (n, 2) alias table of abundance x multiplicity fraction: see `alias_table`
 
 
 @lru_cache(maxsize=2)
@@ -92,43 +97,15 @@ def tables_of(population: Population) -> Tables:
     tables : Tables
         In float32.
     """
-    law, tracks, stars = population.law, population.tracks, population.stars
-    given = ~np.isnan(law.mass_ratio)
-    g = law.mass_ratio_exponent + 1
-    power_law = (np.abs(g) > 1e-9) & ~given
-    log2_10, magnitude_to_log2 = math.log2(10.0), -0.4 * math.log2(10.0)
-    laws = np.stack(
-        [
-            law.log_a_sigma * log2_10,
-            ndtr((law.log_a_max - law.log_a) / law.log_a_sigma),
-            np.divide(1.0, g, out=np.zeros_like(g), where=power_law),
-            np.where(power_law, law.mass_ratio_min ** np.where(power_law, g, 1.0), 1.0),
-            np.where(power_law | given, 0.0, np.log2(law.mass_ratio_min)),
-            law.multiplicity_fraction,
-            np.zeros_like(g),
-            np.zeros_like(g),
-        ],
-        axis=1,
-    ).astype(np.float32)
-    law_rows, law_number = np.unique(laws, axis=0, return_inverse=True)
+    law, tracks = population.law, population.tracks
+    log2_10 = math.log2(10.0)
     groups, group_number = np.unique(tracks.index, axis=0, return_inverse=True)
-    light = tracks.magnitude * magnitude_to_log2
+    light = tracks.magnitude * _MAGNITUDE_TO_LOG2
     group_rows = [np.concatenate([light[:-1, group], light[1:, group]], axis=1) for group in groups]
-    columns = [
-        (law.log_a - np.log10(stars.distance)) * log2_10
-        - math.log2(population.cut / CUT),  # au / pc = arcsec
-        np.log2(stars.mass * np.where(given, law.mass_ratio, 1.0)),
-        magnitudes(tracks, stars.mass[:, None])[:, 0] * magnitude_to_log2,
-        *tracks.weight.T[1:],
-    ]
-    numbers = [
-        number.astype(np.int32).view(np.float32)
-        for number in (group_number.ravel() * (light.shape[0] - 1), law_number.ravel())
-    ]
-    equal = bool(np.all(population.weight == 1.0))
+    equal, abundance = bool(np.all(population.weight == 1.0)), population.abundance
+    alike = bool(np.all(abundance == 1.0))
     return Tables(
-        star=np.stack([*(column.astype(np.float32) for column in columns), *numbers], axis=1),
-        law=law_rows,
+        star=_star_rows(population, group_number.ravel() * (light.shape[0] - 1)),
         track=np.ascontiguousarray(np.concatenate(group_rows), dtype=np.float32),
         n_grid=light.shape[0] - 1,
         grid_start=np.float32(tracks.log_mass_min * log2_10),
@@ -137,8 +114,34 @@ def tables_of(population: Population) -> Tables:
         isotropic=population.projection == "isotropic",
         largest_fraction=float(law.multiplicity_fraction.max()),
         weight=np.empty(0, np.float32) if equal else population.weight.astype(np.float32),
-        alias=alias_table(law.multiplicity_fraction),
+        abundance=np.empty(0, np.float32) if alike else (abundance / abundance.max()).astype(np.float32),
+        alias=alias_table(abundance * law.multiplicity_fraction),
     )
+
+
+def _star_rows(population: Population, base: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Rows of the stars, each on one line of a CPU's cache; `base` is the first row of each one's tracks."""
+    law, stars, tracks = population.law, population.stars, population.tracks
+    given = ~np.isnan(law.mass_ratio)
+    g = law.mass_ratio_exponent + 1
+    power_law = (np.abs(g) > 1e-9) & ~given
+    log2_10 = math.log2(10.0)
+    n, q_min = base.size, law.mass_ratio_min / law.mass_ratio_max
+    room = np.zeros((n + 1) * WIDTH, np.float32)
+    start = -room.ctypes.data % (4 * WIDTH) // 4
+    rows = room[start : start + n * WIDTH].reshape(n, WIDTH)
+    rows[:, A] = (law.log_a - np.log10(stars.distance)) * log2_10 - math.log2(population.cut / CUT)
+    rows[:, SIGMA] = law.log_a_sigma * log2_10
+    rows[:, TRUNCATION] = ndtr((law.log_a_max - law.log_a) / law.log_a_sigma)
+    rows[:, MASS] = np.log2(stars.mass * np.where(given, law.mass_ratio, law.mass_ratio_max))
+    rows[:, Q_SLOPE] = np.divide(1.0, g, out=np.zeros_like(g), where=power_law)
+    rows[:, Q_START] = np.where(power_law, q_min ** np.where(power_law, g, 1.0), 1.0)
+    rows[:, Q_FLAT] = np.where(power_law | given, 0.0, np.log2(q_min))
+    rows[:, BASE] = base.astype(np.int32).view(np.float32)
+    rows[:, DIMMING] = -0.25 * _MAGNITUDE_TO_LOG2 * magnitudes(tracks, stars.mass[:, None])[:, 0]
+    rows[:, FRACTION] = law.multiplicity_fraction
+    rows[:, W0:] = tracks.weight
+    return rows
 
 
 @njit(cache=True)
@@ -216,8 +219,8 @@ def single_star(tables, scale, key_low, key_high, stack_low, stack_high, draw): 
         words = philox(key_low, key_high, draw, SINGLE_STAGE, stack_low, stack_high)
         draw += 1
         star = int64((uint64(words[0]) * uint64(tables.alias.shape[0])) >> uint64(32))
-        law = bits(tables.star[star, LAW])
-        if uniform_pair(words[1], words[2]) >= scale * tables.law[law, FRACTION]:
+        is_here = tables.abundance.size == 0 or unit(words[3]) < tables.abundance[star]
+        if is_here and uniform_pair(words[1], words[2]) >= scale * tables.star[star, FRACTION]:
             single = star
     return single, draw
 
@@ -262,12 +265,15 @@ def place_on_track(mass, start, per_unit, n_grid):  # type: ignore[no-untyped-de
 
 
 @_step
-def flux_ratio(w1, w2, w3, t, l0, l1, l2, l3, r0, r1, r2, r3, primary_flux, is_dark):  # type: ignore[no-untyped-def]
-    """Flux of the companion over that of the primary, linear on the star's own mean of four tracks."""
-    w0 = float32(1) - (w1 + w2 + w3)
-    left = w0 * l0 + w1 * l1 + w2 * l2 + w3 * l3
-    right = w0 * r0 + w1 * r1 + w2 * r2 + w3 * r3
-    ratio = smaller(exp2(left + t * (right - left) - primary_flux), float32(1))
+def light(w0, w1, w2, w3, l0, l1, l2, l3, dimming):  # type: ignore[no-untyped-def]
+    """Binary logarithm of the flux over that of the primary, on a star's own mean of four tracks."""
+    return (w0 * l0 + dimming) + (w2 * l2 + dimming) + ((w1 * l1 + dimming) + (w3 * l3 + dimming))
+
+
+@_step
+def flux_ratio(left, right, t, is_dark):  # type: ignore[no-untyped-def]
+    """Flux of the companion over that of the primary, from `light` at two masses."""
+    ratio = smaller(exp2(left + t * (right - left)), float32(1))
     return float32(0) if is_dark else ratio
 
 

@@ -102,7 +102,7 @@ class Companions:
 
     @classmethod
     def of(cls, population: Population, binary_fraction: float) -> Companions:
-        """Companions of a population with isotropic orbits, a full log-normal of axes and equal weights.
+        """Companions of one class, with isotropic orbits, a full log-normal of axes and equal weights.
 
         Parameters
         ----------
@@ -123,7 +123,11 @@ class Companions:
         """
         law, stars, tracks = population.law, population.stars, population.tracks
         known = not np.any(
-            np.isfinite(law.log_a_max) | np.isfinite(law.mass_ratio) | (population.weight != 1)
+            np.isfinite(law.log_a_max)
+            | np.isfinite(law.mass_ratio)
+            | (law.mass_ratio_max != 1)
+            | (law.share != 1)
+            | (population.weight != 1)
         )
         if not known or population.projection != "isotropic" or np.any(law.mass_ratio_exponent == -1):
             raise ValueError(f"population must have a full log-normal and isotropic orbits, got {law}")

@@ -6,15 +6,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from porrima.config import RunConfig
 from porrima.errors import InputError
+from porrima.selection import Combined, read_selection
 from porrima.systems import BRIGHT_MASS, Population
 
 if TYPE_CHECKING:
     from porrima.catalogs import Catalog
     from porrima.config import PopulationConfig
+    from porrima.response import Response
+    from porrima.selection import Selection
     from porrima.stars import Stars
 
-__all__ = ["catalog_of", "draw_stars", "population_of"]
+__all__ = ["catalog_of", "draw_stars", "population_of", "selection_of"]
 
 _GALAXY_STREAM = 1  # spawn key of the stars' generator; the engine's streams are keyed by the seed alone
 
@@ -95,15 +99,17 @@ def draw_stars(config: PopulationConfig, catalog: Catalog | None = None) -> Star
     return selected
 
 
-def population_of(config: PopulationConfig, stars: Stars) -> Population:
+def population_of(config: PopulationConfig, stars: Stars, response: Response | None = None) -> Population:
     """Population of a configuration.
 
     Parameters
     ----------
     config : PopulationConfig
-        Models and cut.
+        Models, cut and selection.
     stars : Stars
         Already selected.
+    response : Response, optional
+        Of the PSF that stars are clipped behind; that of the configuration where not given.
 
     Returns
     -------
@@ -116,4 +122,69 @@ def population_of(config: PopulationConfig, stars: Stars) -> Population:
         photometry=config.photometry.build(),
         cut=config.cut,
         stack_weight=config.stack_weight,
+        selection=selection_of(config, response),
     )
+
+
+def selection_of(config: PopulationConfig, response: Response | None = None) -> Selection | None:
+    """Selection of a configuration.
+
+    Parameters
+    ----------
+    config : PopulationConfig
+        With the key ``selection``, or without.
+    response : Response, optional
+        Of the PSF that stars are clipped behind; that of the configuration where not given.
+
+    Returns
+    -------
+    selection : Selection or None
+        None where there is none.
+
+    Raises
+    ------
+    InputError
+        If the table is wrong, or it is not clear which PSF is meant.
+    """
+    wanted = config.selection
+    if wanted is None:
+        return None
+    parts: list[Selection] = []
+    if wanted.clip is not None:
+        from porrima.clip import Clip, Noise  # noqa: PLC0415  (the response, where used)
+
+        noise = wanted.noise or 0.0
+        magnitudes = sorted(noise) if isinstance(noise, dict) else [0.0]
+        sigma = [noise[m] for m in magnitudes] if isinstance(noise, dict) else [noise]
+        parts.append(
+            Clip(
+                response=_clipped_behind(config, response),
+                threshold=wanted.clip,
+                quantity=wanted.quantity,
+                noise=Noise(magnitude=tuple(magnitudes), sigma=tuple(sigma)),
+            )
+        )
+    if wanted.table is not None:
+        parts.append(read_selection(wanted.table))
+    return parts[0] if len(parts) == 1 else Combined(parts=tuple(parts))
+
+
+def _clipped_behind(config: PopulationConfig, given: Response | None) -> Response:
+    """Response of the PSF that stars are clipped behind."""
+    from porrima.psf import psf_from_name  # noqa: PLC0415  (GalSim, where used)
+    from porrima.response import response  # noqa: PLC0415
+    from porrima.shapes import estimator_from_name  # noqa: PLC0415
+
+    name = config.selection.psf if config.selection is not None else None
+    if given is not None:
+        if name is not None:
+            raise InputError("is that of the command", key="selection.psf", value=name)
+        return given
+    if not isinstance(config, RunConfig):
+        raise InputError("needs a PSF", key="selection.clip")
+    if name is None and len(config.psf) == 1:
+        (name,) = config.psf
+    if name not in config.psf:
+        rule = f"must name the PSF that stars are clipped behind, one of {', '.join(config.psf)}"
+        raise InputError(rule, key="selection.psf", value=name)
+    return response(psf_from_name(name, **config.psf_options), estimator_from_name(config.estimator))

@@ -94,7 +94,7 @@ def simulate(
     """
     check_output(path, resume)
     run = _Run.of(config, population_of(config, draw_stars(config)), method, device)
-    known = header(config, run.population.stars, run.alone, method=method, identity=run.identity)
+    known = header(config, run.population.primaries, run.alone, method=method, identity=run.identity)
     if workers is None and scheduler is None:
         run.draw(0, 0)  # refuses a device that is not there before a store is made
     layout = {"n_stacks": config.n_stacks, "chunk": chunk or CHUNK[method]}
@@ -186,13 +186,18 @@ class _Run:
     @property
     def identity(self) -> str:
         """Hash of all that the numbers depend on."""
-        rest = self.config.model_copy(update={"stars": None})  # wherever the stars came from, here they are
+        rest, table = self.config.model_copy(update={"stars": None}), None  # wherever the stars came from
+        if rest.selection is not None and rest.selection.table is not None:
+            table = rest.selection.table.read_bytes()
+            rest = rest.model_copy(update={"selection": rest.selection.model_copy(update={"table": None})})
         digest = hashlib.sha256(f"{canonical(rest)} {self.method} {self.device} {__version__}".encode())
-        digest.update(self.population.stars.band.encode())
+        digest.update(table or b"")
+        stars = self.population.primaries
+        digest.update(stars.band.encode())
         for shape in self.alone.T:  # a file of a PSF's name may have changed
             digest.update(" ".join(f"{number:.9f}" for number in shape).encode())
         for name in STAR_COLUMNS:
-            digest.update(star_column(self.population.stars, name).tobytes())
+            digest.update(star_column(stars, name).tobytes())
         return digest.hexdigest()
 
 

@@ -28,8 +28,11 @@ from porrima.blocks import (
     sum_block,
     weigh_block,
 )
+from porrima.errors import InputError
 from porrima.moments import INDICES, N_MOMENTS, KernelMoments
-from porrima.pairs import CUT, MOST_TRIES, single_star, tables_of
+from porrima.pairs import CUT, MOST_TRIES, tables_of
+from porrima.rejection import kept_single, lost_singles, reject_block, single_loss
+from porrima.screen import screen_of
 from porrima.streams import COUNT_STAGE, FRACTION_STAGE, binomial, halves, philox, uniform_pair
 from porrima.systems import Systems
 
@@ -112,8 +115,11 @@ def draw_stacks(
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(last - first)
     sums = np.zeros((last - first, N_MOMENTS))
     unit = np.array([(population.cut / CUT) ** (a + b) for a, b in INDICES])
-    fill = _filler(device)
-    fill(tables_of(population), np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
+    screen, fill = screen_of(population), _filler(device)
+    chosen = () if device == "cuda" else (screen, single_loss(population, screen, scale))
+    if device == "cuda" and not screen.is_empty:
+        raise InputError("must be cpu for a run with a selection", key="device", value=device)
+    fill(tables_of(population), *chosen, np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
     if np.any(np.isnan(sums[:, 0])):
         raise ValueError(
             f"cut must leave some pairs unresolved at this binary fraction, got {population.cut}"
@@ -151,7 +157,11 @@ def draw_systems(
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(1)
     listed, sums = np.full((n_stars, 4), -1.0), np.zeros(N_MOMENTS)
     block, key = np.zeros(BLOCK_SIZE, np.float32), np.uint64(seed)
-    _draw_stack(tables_of(population), block, key, stack, n_stars, fractions[0], scale[0], sums, listed)
+    screen = screen_of(population)
+    loss = single_loss(population, screen, scale)[0]
+    _draw_stack(
+        tables_of(population), screen, loss, block, key, stack, n_stars, fractions[0], scale[0], sums, listed
+    )
     flux_ratio, dx, dy, weight = listed.T
     unit = population.cut / CUT
     return Systems.from_pairs(flux_ratio, dx * unit, dy * unit, weight)
@@ -183,7 +193,7 @@ def _fractions(
         _uniform_fractions(np.uint64(seed), first, fractions)
         return fractions
     if binary_fraction == "model":
-        return np.full(last - first, population.law.multiplicity_fraction.mean())
+        return np.full(last - first, (population.abundance * population.law.multiplicity_fraction).mean())
     if not 0 <= float(binary_fraction) <= 1:
         raise ValueError(f"binary_fraction must be in [0, 1], got {binary_fraction}")
     return np.full(last - first, float(binary_fraction))
@@ -199,19 +209,26 @@ def _uniform_fractions(seed, first, fractions):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True, _nrt=False, cache=True)
-def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, listed):  # type: ignore[no-untyped-def]
+def _draw_stack(tables, screen, loss, block, seed, stack, n_stars, fraction, scale, sums, listed):  # type: ignore[no-untyped-def]
     """Sum of the weights of one stack, with those of its moments, in the unit of length, in `sums`.
 
     Its systems are listed where `listed` has rows.
 
     The pairs of a stack are one stream.  As many are taken as the binomial draw says; for each that is resolved
-    another star is drawn, which is a pair with the same probability, until none is.
+    another star is drawn, which is a pair with the same probability, until none is.  So it is for each pair and each
+    single star that a selection rejects.
     """
     key_low, key_high = halves(seed)
     low, high = halves(stack)
     wanted, draw = binomial(n_stars, fraction, key_low, key_high, COUNT_STAGE, low, high, 0)
-    n_blocks, resolved, kept, total, lane = 0, 0, 0, 0.0, LANES
-    while wanted > 0:
+    resolved, lost_draw = lost_singles(n_stars - wanted, loss, key_low, key_high, low, high, 0)
+    n_blocks, kept, total, lane = 0, 0, 0.0, LANES
+    while wanted > 0 or resolved > 0:
+        if wanted == 0:
+            places = resolved
+            wanted, draw = binomial(places, fraction, key_low, key_high, COUNT_STAGE, low, high, draw)
+            resolved, lost_draw = lost_singles(places - wanted, loss, key_low, key_high, low, high, lost_draw)
+            continue
         if lane == LANES:
             if n_blocks > 0:
                 total += _add_block(tables.weight, block, listed)
@@ -220,6 +237,8 @@ def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, list
             if n_blocks * LANES > MOST_TRIES * (n_stars + 100):
                 return np.nan
             draw_block(tables, block, scale, key_low, key_high, low, high, n_blocks * LANES)
+            if screen.score.size > 0:
+                reject_block(screen, block, key_low, key_high, low, high, n_blocks * LANES)
             n_blocks, lane = n_blocks + 1, 0
         if lane == 0 and wanted >= LANES:
             n_valid, n_kept = keep_block(block)
@@ -227,15 +246,12 @@ def _draw_stack(tables, block, seed, stack, n_stars, fraction, scale, sums, list
         else:
             lane, n_valid, n_kept = keep_lanes(block, lane, wanted)
         wanted, resolved, kept = wanted - n_valid, resolved + n_valid - n_kept, kept + n_kept
-        if wanted == 0 and resolved > 0:
-            wanted, draw = binomial(resolved, fraction, key_low, key_high, COUNT_STAGE, low, high, draw)
-            resolved = 0
     if n_blocks > 0:
         total += _add_block(tables.weight, block, listed)
         flush(block, sums)
     if tables.weight.size == 0 and listed.shape[0] == 0:  # single stars cost nothing
         return float(n_stars)
-    return total + _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, listed)
+    return total + _add_singles(tables, screen, key_low, key_high, low, high, n_stars, kept, scale, listed)
 
 
 @njit(forceinline=True, _nrt=False)
@@ -256,13 +272,13 @@ def _add_block(weight, block, listed):  # type: ignore[no-untyped-def]
 
 
 @njit(_nrt=False)
-def _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, listed):  # type: ignore[no-untyped-def]
+def _add_singles(tables, screen, key_low, key_high, low, high, n_stars, kept, scale, listed):  # type: ignore[no-untyped-def]
     """Total weight of the single stars of a stack, each listed where `listed` has rows."""
     total, draw = 0.0, 0
     for single in range(kept, n_stars):
         weight = 1.0
         if tables.weight.size > 0:
-            star, draw = single_star(tables, scale, key_low, key_high, low, high, draw)
+            star, draw = kept_single(tables, screen, scale, key_low, key_high, low, high, draw)
             weight = float(tables.weight[star])
         total += weight
         if listed.shape[0] > 0:
@@ -271,7 +287,7 @@ def _add_singles(tables, key_low, key_high, low, high, n_stars, kept, scale, lis
 
 
 @njit(cache=True, parallel=True)
-def _fill(tables, seed, first, n_stars, fractions, scale, unit, sums):  # type: ignore[no-untyped-def]
+def _fill(tables, screen, loss, seed, first, n_stars, fractions, scale, unit, sums):  # type: ignore[no-untyped-def]
     """Stacks of a range, a few at a time on each thread; `unit` turns lengths to arcsec."""
     n_batches = (fractions.size + _BATCH - 1) // _BATCH
     for batch in prange(n_batches):
@@ -279,7 +295,17 @@ def _fill(tables, seed, first, n_stars, fractions, scale, unit, sums):  # type: 
         listed = np.empty((0, 4))
         for s in range(batch * _BATCH, min((batch + 1) * _BATCH, fractions.size)):
             total = _draw_stack(
-                tables, block, seed, first + s, n_stars, fractions[s], scale[s], sums[s], listed
+                tables,
+                screen,
+                loss[s],
+                block,
+                seed,
+                first + s,
+                n_stars,
+                fractions[s],
+                scale[s],
+                sums[s],
+                listed,
             )
             norm = 1.0 / total
             for k in range(sums.shape[1]):

@@ -27,6 +27,7 @@ from porrima.config import RunConfig, canonical, parse
 from porrima.errors import InputError, RunError
 from porrima.lock import locked, token_of
 from porrima.moments import INDICES, N_MOMENTS
+from porrima.multiplicity import PAPERS
 from porrima.sample import population_of
 from porrima.stars import Stars
 from porrima.tallies import FINE, QUANTITIES, STATISTICS
@@ -310,7 +311,8 @@ def _references(config: RunConfig) -> list[str]:
     """Papers that the models of a run ask to be cited."""
     light = {"main-sequence": "Bressan et al. 2012", "habets-heintze": "Habets & Heintze 1981"}
     stars = str(config.stars.catalog) if config.stars.catalog else "Robin et al. 2003"
-    return ["KCM16 (arXiv:1512.01549)", "Duchene & Kraus 2013", light[config.photometry.model], stars]
+    companions = PAPERS[config.multiplicity.model]
+    return ["KCM16 (arXiv:1512.01549)", companions, light[config.photometry.model], stars]
 
 
 @contextmanager

@@ -12,12 +12,14 @@ import math
 from numba import int32, njit, uint32, uint64
 
 __all__ = [
-    "COUNT_STAGE", "FRACTION_STAGE", "PAIR_STAGE", "PHASE_STAGE", "SINGLE_STAGE", "binomial", "halves", "philox",
-    "uniform_pair",
+    "ALONE_STAGE", "COUNT_STAGE", "FRACTION_STAGE", "LOST_STAGE", "PAIR_STAGE", "PHASE_STAGE", "SCREEN_STAGE",
+    "SINGLE_STAGE", "binomial", "halves", "philox", "uniform_pair",
 ]  # fmt: skip
 
-FRACTION_STAGE, COUNT_STAGE, PAIR_STAGE, SINGLE_STAGE, PHASE_STAGE = range(5)
-"""Stages of a stack, each with a stream of its own."""
+FRACTION_STAGE, COUNT_STAGE, PAIR_STAGE, SINGLE_STAGE, PHASE_STAGE, LOST_STAGE, ALONE_STAGE, SCREEN_STAGE = (
+    range(8)
+)
+"""Stages of a stack, each with a stream of its own; every layer of a selection has another from the last on."""
 
 _LOW = uint64(0xFFFFFFFF)
 

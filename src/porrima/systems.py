@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from porrima.companions import multiplicity_scale
 from porrima.errors import InputError
 from porrima.moments import KernelMoments, moments_of_points
-from porrima.multiplicity import multiplicity_scale
 from porrima.units import to_internal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from porrima.multiplicity import CompanionLaw, MultiplicityModel
+    from porrima.companions import CompanionLaw, MultiplicityModel
     from porrima.orbits import Projection
     from porrima.photometry import MassLuminosity, Tracks
+    from porrima.selection import Selection
     from porrima.stars import Stars
 
     FloatArray = NDArray[np.float64]
@@ -40,9 +41,9 @@ class Population:
     Parameters
     ----------
     stars : Stars
-        The n primaries, with the magnitude of the whole system.
+        The primaries, with the magnitude of the whole system: n rows, each star once for every class of companions.
     law : CompanionLaw
-        Statistics of their companions.
+        Statistics of their companions, a class to a row.
     tracks : Tracks
         Mass-luminosity relation with each star's place in it.
     projection : {"isotropic", "inclination-uniform"}
@@ -51,6 +52,8 @@ class Population:
         Projected separation at or above which a pair is resolved and leaves the sample, in arcsec.
     weight : (n,) float array
         Weight of each star's unit-flux image in a stack, dimensionless, with mean 1.
+    selection : Selection or None
+        What else the survey rejects, single stars among it.
     """
 
     stars: Stars
@@ -59,6 +62,7 @@ class Population:
     projection: Projection
     cut: float
     weight: FloatArray
+    selection: Selection | None = None
 
     @classmethod
     def of(
@@ -69,6 +73,7 @@ class Population:
         photometry: MassLuminosity,
         cut: float = 0.05,
         stack_weight: StackWeight = "equal",
+        selection: Selection | None = None,
     ) -> Population:
         """Population of given stars.
 
@@ -84,11 +89,13 @@ class Population:
             Separation from which a pair is resolved, in arcsec, positive.
         stack_weight : {"equal", "flux"}
             Whether every star counts alike in a stack, or in proportion to its flux.
+        selection : Selection, optional
+            What else the survey rejects.
 
         Returns
         -------
         population : Population
-            Of the n stars.
+            Of these stars.
 
         Raises
         ------
@@ -100,7 +107,7 @@ class Population:
         if not 0 < cut < np.inf:
             raise InputError("must be positive and finite [arcsec]", key="cut", value=cut)
         try:
-            law = multiplicity.companions(stars.mass)
+            law = multiplicity.companions(stars.mass, stars.metallicity)
             if stars.mass_ratio is not None:
                 law = law.with_given(stars.mass_ratio)
             tracks = photometry.tracks(stars.mass, stars.metallicity, stars.log_age, stars.band)
@@ -108,9 +115,24 @@ class Population:
             raise InputError(str(error), source=stars.source or None) from None
         flux = 10.0 ** (-0.4 * (stars.magnitude - stars.magnitude.min()))
         weight = flux / flux.mean() if stack_weight == "flux" else np.ones(len(stars))
+        if law.star.size > len(stars):
+            stars, weight = stars.take(law.star), weight[law.star]
+            tracks = replace(tracks, index=tracks.index[law.star], weight=tracks.weight[law.star])
         return cls(
-            stars=stars, law=law, tracks=tracks, projection=multiplicity.projection, cut=cut, weight=weight
-        )
+            stars=stars, law=law, tracks=tracks, projection=multiplicity.projection, cut=cut, weight=weight,
+            selection=selection,
+        )  # fmt: skip
+
+    @property
+    def abundance(self) -> FloatArray:
+        """How much each row counts among the stars, (n,), with mean 1; 1 where stars have one class of companions."""
+        return self.law.abundance
+
+    @property
+    def primaries(self) -> Stars:
+        """The stars, each once."""
+        first = self.law.first
+        return self.stars if first.size == len(self.stars) else self.stars.take(first)
 
     def scale(self, binary_fraction: FloatArray | None) -> FloatArray:
         """Factor on all multiplicity fractions for each wanted binary fraction; see `multiplicity_scale`.
@@ -127,7 +149,7 @@ class Population:
         """
         if binary_fraction is None:
             return np.ones(1)
-        return multiplicity_scale(self.law.multiplicity_fraction, binary_fraction)
+        return multiplicity_scale(self.law.multiplicity_fraction, binary_fraction, self.abundance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -7,13 +7,16 @@ made the other way, in all combinations.  Nothing is drawn.
 from __future__ import annotations
 
 import itertools
+import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from porrima.averages import population_moments
+from porrima.companions import MassRangeWarning, RowErrors
 from porrima.integrals import PairIntegrals, coefficient_moments, integrate, separation_moments
+from porrima.multiplicity import COMPILATIONS, MULTIPLICITY
 from porrima.photometry import PHOTOMETRY
 from porrima.prediction import MANY_STARS, QUANTITIES, predict
 from porrima.systems import Population
@@ -23,15 +26,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from porrima.multiplicity import DucheneKraus2013
+    from porrima.companions import MultiplicityModel
     from porrima.photometry import MassLuminosity
     from porrima.prediction import Prediction
     from porrima.response import Response
+    from porrima.selection import Selection
     from porrima.stars import Stars
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["CUT_ERROR", "NAMES", "ROW_ERRORS", "RowErrors", "Source", "Uncertainty", "uncertainty"]
+__all__ = ["CUT_ERROR", "NAMES", "Source", "Uncertainty", "uncertainty"]
 
 NAMES = ("eta", *(f"{kind}_{q}" for kind in ("bias", "sd", "sigma") for q in QUANTITIES))
 """What is given an interval, dimensionless: as in `prediction.Prediction`."""
@@ -43,26 +47,13 @@ separation on (assumed; no source)."""
 MOST_STARS = 1000
 """Stars on which changes are found, evenly through those given in mass and distance (count)."""
 
+FEW_STARS = 300
+"""Stars on which other models are tried, and changes of a model with several classes to a star (count)."""
+
 _INTERVALS = 32  # of the rule over the mass ratio for changes: its error, 5e-4, is the same before and after
 
 
-class RowErrors(NamedTuple):
-    """Errors of one row of the multiplicity table, one standard deviation down and up."""
-
-    multiplicity_fraction: tuple[float, float]
-    mass_ratio_exponent: tuple[float, float]
-    log_a: tuple[float, float]  # dex
-    sigma_log_period: tuple[float, float]  # dex
-
-
-ROW_ERRORS = (
-    RowErrors((0.04, 0.06), (1.0, 1.0), (0.05, 0.05), (0.25, 0.25)),
-    RowErrors((0.03, 0.03), (0.2, 0.2), (0.30, 0.30), (0.25, 0.25)),
-    RowErrors((0.02, 0.02), (0.1, 0.1), (0.05, 0.05), (0.10, 0.10)),
-)
-"""Below 0.1, 0.1-0.5 and about 1 M_sun.  Multiplicity fractions and exponents as published (Duchene & Kraus 2013);
-they give no error of mean separations and widths: half the distance to the later compilations is taken (Winters et
-al. 2019: 20 au; Susemiehl & Meyer 2022: 27 and 50 au; Offner et al. 2023: 4, 25 and 40 au and their widths)."""
+_FIGURES = {"log_a": "mean_separation"}  # of a row of the table: the source's name, where it is another one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,8 +64,9 @@ class Source:
     ----------
     name : str
         Such as ``multiplicity_fraction`` or ``photometry``.
-    kind : {"error", "choice", "sample"}
-        An error of one standard deviation, a choice made the other way, or the finite number of stars.
+    kind : {"error", "choice", "sample", "model"}
+        An error of one standard deviation, a choice made the other way, the finite number of stars, or another model
+        of multiplicity, which is no part of the interval.
     low, high : (n_name,) float array
         Largest changes of `NAMES` down (not positive) and up (not negative), dimensionless.
     """
@@ -96,7 +88,9 @@ class Uncertainty:
     value, low, high : (n_name,) float array
         Of `NAMES`, dimensionless: as predicted, and the ends of the interval.
     sources : tuple of Source
-        One for each kind of figure, choice and the stars.
+        One for each kind of figure, choice, the stars and the models.
+    models : dict of (n_name,) float array
+        What other compilations of multiplicity give for the same stars, dimensionless, by name.
     """
 
     prediction: Prediction
@@ -104,6 +98,7 @@ class Uncertainty:
     low: FloatArray
     high: FloatArray
     sources: tuple[Source, ...]
+    models: dict[str, FloatArray]
 
     def interval(self, name: str) -> tuple[float, float]:
         """Ends of the interval of one quantity.
@@ -144,14 +139,15 @@ def uncertainty(
     stars: Stars,
     response: Response,
     *,
-    multiplicity: DucheneKraus2013,
+    multiplicity: MultiplicityModel,
     photometry: MassLuminosity,
     cut: float = 0.05,
     binary_fraction: float | None = None,
     n_stars: int | None = None,
-    row_errors: tuple[RowErrors, ...] = ROW_ERRORS,
+    row_errors: tuple[RowErrors, ...] | None = None,
     cut_error: float = CUT_ERROR,
     integrals: PairIntegrals | None = None,
+    selection: Selection | None = None,
 ) -> Uncertainty:
     r"""Interval of a prediction from the errors of the multiplicity table and the choices of the models.
 
@@ -161,8 +157,8 @@ def uncertainty(
         Those of a stack, of equal weight.
     response : Response
         Of the PSF and estimator.
-    multiplicity : DucheneKraus2013
-        The table and its gap rule.
+    multiplicity : MultiplicityModel
+        The table and how it is read.
     photometry : MassLuminosity
         The relation in use.
     cut : float
@@ -172,12 +168,14 @@ def uncertainty(
         between rows.  None for the model's own, which they move.
     n_stars : int, optional
         Stars in the stack (count); None for infinitely many.
-    row_errors : tuple of RowErrors
-        Of the three rows of the table.
+    row_errors : tuple of RowErrors, optional
+        Of the rows of the table; the model's own where not given.
     cut_error : float
         Relative error of the cut, in [0, 1).
     integrals : PairIntegrals, optional
         Of the population with the models as given, where they are known already.
+    selection : Selection, optional
+        What else the survey rejects, taken as exact.
 
     Returns
     -------
@@ -193,12 +191,16 @@ def uncertainty(
 
     Notes
     -----
-    Each figure is moved down and up by its error, and the changes of a kind of figure in the three rows, of the
-    kinds, of the cut and of the sample of stars are added in quadrature, as independent.  The choices (photometry:
-    `MainSequence` or `HabetsHeintze1981`; gap rule; projection) are no errors: the interval reaches from the lowest
-    to the highest of their eight combinations, and by the sum in quadrature beyond.  Changes are found on up to
-    `MOST_STARS` stars, to a few per cent of themselves, with the scatter of a long stack; the prediction itself on
-    all stars.
+    Each figure is moved down and up by its error, and the changes of a kind of figure in the rows, of the kinds, of
+    the cut and of the sample of stars are added in quadrature, as independent.  The choices (photometry:
+    `MainSequence` or `HabetsHeintze1981`; those of the model, such as gap rule and projection) are no errors: the
+    interval reaches from the lowest to the highest of their combinations, and by the sum in quadrature beyond.
+    Changes are found on up to `MOST_STARS` stars, or `FEW_STARS` where stars have several classes of companions, to a
+    few per cent of themselves, with the scatter of a long stack; the prediction itself on all stars.
+
+    The interval is that of the given model.  How far others are from it, those of `multiplicity.COMPILATIONS`, is the
+    source ``model``, on up to `FEW_STARS` stars: a systematic error that no table knows of itself, and that is not
+    put into the interval, for models are few and not independent.
 
     References
     ----------
@@ -206,47 +208,82 @@ def uncertainty(
     """
     if not 0 <= cut_error < 1:
         raise ValueError(f"cut_error must be in [0, 1), got {cut_error}")
-    models = {"multiplicity": multiplicity, "photometry": photometry, "cut": cut}
-    whole = Population.of(stars, **models)  # type: ignore[arg-type]
+    models = {"multiplicity": multiplicity, "photometry": photometry, "cut": cut, "selection": selection}
+    with warnings.catch_warnings():
+        if integrals is not None:  # whoever made them has heard it
+            warnings.simplefilter("ignore", MassRangeWarning)
+        whole = Population.of(stars, **models)  # type: ignore[arg-type]
     integrals = integrate(whole) if integrals is None else integrals
     fraction = None if binary_fraction is None else np.array([binary_fraction])
     prediction = predict(population_moments(whole, integrals, fraction), response, n_stars)
-    some = _thinned(stars)
     judge = _Judge(prediction=prediction, response=response, fraction=fraction)
-    base = Population.of(some, **models)  # type: ignore[arg-type]
-    start = _rough(base)
-    reference = judge.raw(base, start)
-    change = {
-        name: [judge.change(p, i, reference) for p, i in moved]
-        for name, moved in _moved(base, start, multiplicity, row_errors, cut_error).items()
-    }
-    sources = [_combined(name, np.array(changes)) for name, changes in change.items() if changes]
-    choices = {key: judge.change(p, i, reference) for key, (p, i) in _choices(some, models).items()}
-    for number, name in enumerate(("photometry", "gap_rule", "projection")):
-        alone = choices[tuple(k == number for k in range(3))]
-        sources.append(
-            Source(name=name, kind="choice", low=np.minimum(alone, 0.0), high=np.maximum(alone, 0.0))
-        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MassRangeWarning)  # said of the whole already
+        sources, every = _changes(judge, stars, models, row_errors or multiplicity.row_errors, cut_error)
+        others = _other_models(judge, stars, models)
+    if others:
+        changes = np.array(list(others.values())) - judge.value
+        low, high = np.minimum(changes.min(axis=0), 0.0), np.maximum(changes.max(axis=0), 0.0)
+        sources.append(Source(name="model", kind="model", low=low, high=high))
     sampled = judge.sampled(whole, integrals)
     sources.append(Source(name="stars", kind="sample", low=-sampled, high=sampled))
-    independent = [s for s in sources if s.kind != "choice"]
-    every, value = np.array(list(choices.values())), judge.value
+    independent, value = [s for s in sources if s.kind in ("error", "sample")], judge.value
     return Uncertainty(
         prediction=prediction,
         value=value,
         low=value + every.min(axis=0) - np.sqrt(sum(s.low**2 for s in independent)),
         high=value + every.max(axis=0) + np.sqrt(sum(s.high**2 for s in independent)),
         sources=tuple(sources),
+        models=others,
     )
 
 
-def _thinned(stars: Stars) -> Stars:
+def _changes(
+    judge: _Judge, stars: Stars, models: dict[str, Any], row_errors: tuple[RowErrors, ...], cut_error: float
+) -> tuple[list[Source], FloatArray]:
+    """Sources of errors and choices, and the changes by all combinations of the choices, (n, n_name)."""
+    some = _thinned(stars, MOST_STARS)
+    base = Population.of(some, **models)
+    if len(base.stars) > MOST_STARS:
+        some = _thinned(stars, FEW_STARS)
+        base = Population.of(some, **models)
+    start = _rough(base)
+    reference = judge.raw(base, start)
+    change = {
+        name: [judge.change(p, i, reference) for p, i in moved]
+        for name, moved in _moved(base, start, models["multiplicity"], row_errors, cut_error).items()
+    }
+    sources = [_combined(name, np.array(changes)) for name, changes in change.items() if changes]
+    names = ("photometry", *models["multiplicity"].choices)
+    choices = {key: judge.change(p, i, reference) for key, (p, i) in _choices(some, models, names).items()}
+    for number, name in enumerate(names):
+        alone = choices[tuple(k == number for k in range(len(names)))]
+        sources.append(
+            Source(name=name, kind="choice", low=np.minimum(alone, 0.0), high=np.maximum(alone, 0.0))
+        )
+    return sources, np.array(list(choices.values()))
+
+
+def _other_models(judge: _Judge, stars: Stars, models: dict[str, Any]) -> dict[str, FloatArray]:
+    """Quantities by each compilation but the one in use, by name."""
+    few, out = _thinned(stars, FEW_STARS), {}
+    base = Population.of(few, **models)
+    reference = judge.raw(base, _rough(base))
+    for name in COMPILATIONS:
+        if MULTIPLICITY[name] == models["multiplicity"]:
+            continue
+        population = Population.of(few, **(models | {"multiplicity": MULTIPLICITY[name]}))
+        out[name] = judge.value + judge.change(population, _rough(population), reference)
+    return out
+
+
+def _thinned(stars: Stars, most: int) -> Stars:
     """At most so many stars, evenly through mass and, within alike masses, distance."""
-    if len(stars) <= MOST_STARS:
+    if len(stars) <= most:
         return stars
     alike = np.round(np.log10(stars.mass), 1)
     order = np.lexsort((stars.distance, alike))
-    return stars.take(order[((np.arange(MOST_STARS) + 0.5) * len(stars) / MOST_STARS).astype(np.int64)])
+    return stars.take(order[((np.arange(most) + 0.5) * len(stars) / most).astype(np.int64)])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -285,10 +322,12 @@ class _Judge:
         """Standard error of the quantities from the finite number of stars, (n_name,): that of a ratio of sums."""
         own = population.law.multiplicity_fraction
         pair = np.minimum(1.0, population.scale(self.fraction)[0] * own)
-        kept = 1.0 - pair * (1.0 - integrals.unresolved)
+        star, number = population.law.star, population.abundance
+        alone = 1.0 if integrals.single_kept is None else integrals.single_kept
+        kept = np.bincount(star, number * (alone - pair * integrals.lost))
         relative = []
         for power in (1, 2):
-            x = pair * integrals.coefficient[0, :, power] * integrals.separation[0, :, power]
+            x = np.bincount(star, number * pair * integrals.power(power, power))
             rest = x - kept * (x.sum() / kept.sum())
             relative.append(np.sqrt(rest @ rest) / x.sum() if x.sum() > 0 else 0.0)
         ratio = 1.0 + np.repeat([relative[0], 0.5 * relative[1]], [4, 3])
@@ -298,7 +337,7 @@ class _Judge:
 def _moved(
     population: Population,
     integrals: PairIntegrals,
-    model: DucheneKraus2013,
+    model: MultiplicityModel,
     row_errors: tuple[RowErrors, ...],
     cut_error: float,
 ) -> dict[str, Iterator[tuple[Population, PairIntegrals]]]:
@@ -307,24 +346,16 @@ def _moved(
     free = np.isnan(law.mass_ratio)  # pairs that a catalogue has made have no law
     if population.stars.mass_ratio is not None:
         free = np.isnan(population.stars.mass_ratio)
-    width = 2.0 / 3.0 * model.scatter_scale
 
-    def law_with(name: str, change: FloatArray) -> Population:
-        moved: Any = {name: getattr(law, name) + change}
-        if name == "log_a":
-            moved["log_a_max"] = law.log_a_max + change
-        if name == "multiplicity_fraction":
-            moved[name] = np.clip(moved[name], 0.0, 1.0)
-        return replace(population, law=replace(law, **moved))
-
-    def each(figure: str, name: str, scale: float, mine: NDArray[np.bool_]) -> Iterator[Any]:
+    def each(figure: str, mine: NDArray[np.bool_]) -> Iterator[Any]:
         for number, errors in enumerate(row_errors):
             here = mine & (row == number)
             if not here.any():
                 continue
             for error, sign in zip(getattr(errors, figure), (-1.0, 1.0), strict=True):
-                moved = law_with(name, np.where(here, sign * error * scale, 0.0))
-                yield moved, _again(moved, integrals, name)
+                changed = law.moved(figure, np.where(here, sign * error, 0.0))
+                moved = replace(population, law=changed)
+                yield moved, _again(moved, integrals, figure)
 
     def cuts() -> Iterator[Any]:
         for factor in (1.0 - cut_error, 1.0 + cut_error):
@@ -332,17 +363,18 @@ def _moved(
             yield moved, _again(moved, integrals, "cut")
 
     everyone = np.ones_like(free)
-    return {
-        "multiplicity_fraction": each("multiplicity_fraction", "multiplicity_fraction", 1.0, free),
-        "mass_ratio_exponent": each("mass_ratio_exponent", "mass_ratio_exponent", 1.0, free),
-        "mean_separation": each("log_a", "log_a", 1.0, everyone),
-        "sigma_log_period": each("sigma_log_period", "log_a_sigma", width, everyone),
-        "cut": cuts(),
+    of_pairs = ("log_a", "sigma_log_period")
+    sources = {
+        _FIGURES.get(figure, figure): each(figure, everyone if figure in of_pairs else free)
+        for figure in RowErrors._fields
     }
+    return sources | {"cut": cuts()}
 
 
 def _rough(population: Population) -> PairIntegrals:
     """Integrals good enough for changes."""
+    if population.selection is not None:
+        return integrate(population, _INTERVALS)
     return PairIntegrals(
         cut=population.cut,
         coefficient=coefficient_moments(population, _INTERVALS),
@@ -354,6 +386,8 @@ def _again(population: Population, integrals: PairIntegrals, moved: str) -> Pair
     """Integrals of a population of which one figure has moved: only what depends on it is found anew."""
     if moved == "multiplicity_fraction":
         return integrals
+    if population.selection is not None:
+        return _rough(population)
     if moved == "mass_ratio_exponent":
         return replace(integrals, coefficient=coefficient_moments(population, _INTERVALS))
     return replace(integrals, cut=population.cut, separation=separation_moments(population))
@@ -372,27 +406,21 @@ def _combined(name: str, changes: FloatArray) -> Source:
 
 
 def _choices(
-    stars: Stars, models: dict[str, Any]
+    stars: Stars, models: dict[str, Any], names: tuple[str, ...]
 ) -> dict[tuple[bool, ...], tuple[Population, PairIntegrals]]:
-    """Populations with photometry, gap rule and projection each as given or the other way, by what is other."""
+    """Populations with photometry and each option of the model as given or the other way, by what is other."""
     model, photometry = models["multiplicity"], models["photometry"]
-    names = {True: PHOTOMETRY["main-sequence"], False: PHOTOMETRY["habets-heintze"]}
-    other_photometry = names[photometry != names[True]]
-    other_gap = {"lower": "solar", "solar": "lower"}[model.gap_rule]
-    other_projection = {"isotropic": "inclination-uniform", "inclination-uniform": "isotropic"}[
-        model.projection
-    ]
+    lights = PHOTOMETRY["main-sequence"], PHOTOMETRY["habets-heintze"]
+    other_photometry = lights[photometry == lights[0]]
     out: dict[tuple[bool, ...], tuple[Population, PairIntegrals]] = {}
-    for other in itertools.product((False, True), repeat=3):
-        chosen = replace(
-            model,
-            gap_rule=other_gap if other[1] else model.gap_rule,
-            projection=other_projection if other[2] else model.projection,
-        )
+    for other in itertools.product((False, True), repeat=len(names)):
+        is_other = dict(zip(names, other, strict=True))
+        chosen = replace(model, **{name: value for name, value in model.choices.items() if is_other[name]})
         light = other_photometry if other[0] else photometry
-        population = Population.of(stars, multiplicity=chosen, photometry=light, cut=models["cut"])
-        if other[2]:  # the mass ratio knows nothing of the projection
-            coefficient = out[*other[:2], False][1].coefficient
+        population = Population.of(stars, **models | {"multiplicity": chosen, "photometry": light})
+        if is_other.get("projection") and population.selection is None:  # the mass ratio knows nothing of it
+            same = tuple(flag and name != "projection" for name, flag in is_other.items())
+            coefficient = out[same][1].coefficient
             integrals = PairIntegrals(
                 cut=population.cut, coefficient=coefficient, separation=separation_moments(population)
             )

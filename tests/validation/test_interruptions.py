@@ -112,13 +112,13 @@ def test_killed_workers_and_a_killed_client_change_no_byte(whole, tmp_path, reco
     path, rng, kills = tmp_path / "run.zarr", np.random.Generator(np.random.Philox(20261124)), 0
     arguments = ("simulate", folder / "run.yaml", "-o", path, "--resume", "--workers", 2, "--chunk", CHUNK)
     for end in (40, 200, N_STACKS):  # chunks after which the client itself is killed; the last time it is not
-        process = command(*arguments, start_new_session=True)
+        process, before = command(*arguments, start_new_session=True), len(chunks(path, "tally"))
         while process.poll() is None and len(chunks(path, "tally")) < end:
             time.sleep(rng.uniform(0, 2))
             workers = [
                 p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())
             ]
-            if len(workers) == 2 and len(chunks(path, "tally")) > 0 and kills < 8:
+            if len(workers) == 2 and len(chunks(path, "tally")) > before and kills < 8:
                 os.kill(rng.choice([p.pid for p in workers]), signal.SIGKILL)
                 kills += 1
         if end < N_STACKS:

@@ -23,7 +23,7 @@ HOT, COOL = (5800.0, 3400.0, 0.1), (4500.0, 3000.0, 0.3)  # primary [K], compani
 
 
 def coarse(wavelength, throughput):
-    """Band of few wavelengths, for GalSim draws each: mean throughputs of cells, so that sharp edges stay where they are."""
+    """Band of few wavelengths, for GalSim draws each: means of cells, so that sharp edges stay."""
     step = (wavelength[-1] - wavelength[0]) / (N_DRAWN - 2)
     grid = np.linspace(wavelength[0] - step / 2, wavelength[-1] + step / 2, N_DRAWN)
     up_to = np.concatenate([[0.0], np.cumsum(0.5 * (throughput[1:] + throughput[:-1]) * np.diff(wavelength))])
