@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from porrima.multiplicity import MULTIPLICITY
+from porrima.multiplicity import MULTIPLICITY, ROW_ERRORS
 from porrima.photometry import PHOTOMETRY
 from porrima.psf import psf_from_name
 from porrima.shapes import Adaptive
 from porrima.systems import Population
 from porrima.trials import coverage, draw_wrong, trials
-from porrima.uncertainty import CUT_ERROR, ROW_ERRORS
+from porrima.uncertainty import CUT_ERROR
 from statistics_helpers import assert_within_sigma
 
 MODEL = MULTIPLICITY["dk13"]

@@ -237,7 +237,7 @@ class Correction:
     @property
     def model(self) -> FloatArray:
         """Residuals of one standard deviation by the model's errors, over the bias, down and up, (2,)."""
-        parts = [ends for name, ends in self.sources.items() if self.kinds[name] != "choice"]
+        parts = [ends for name, ends in self.sources.items() if self.kinds[name] in ("error", "sample")]
         total: FloatArray = np.array([-1.0, 1.0]) * np.sqrt(np.sum(np.square(parts), axis=0))
         return total
 
@@ -306,7 +306,7 @@ def correct(
     k = NAMES.index("bias_r2")
     own = float(known.value[k]) or 1.0
     sources = {s.name: _sorted(s.low[k] / own, s.high[k] / own) for s in known.sources}
-    errors = [sources[s.name] for s in known.sources if s.kind != "choice"]
+    errors = [sources[s.name] for s in known.sources if s.kind in ("error", "sample")]
     down, up = np.sqrt(np.sum(np.square(errors), axis=0))
     low, high = _sorted(*((end - known.value[k]) / own for end in known.interval("bias_r2")))
     unit, growth = np.array([1.0, 1.0, prediction.r2_0]), _growth(known)
