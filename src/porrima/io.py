@@ -13,12 +13,12 @@ from porrima.systems import Systems
 from porrima.tables import column_values, load_table, open_catalog
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from matplotlib.figure import Figure
 
-__all__ = ["read_galaxies", "read_systems", "write_figure", "write_rows"]
+__all__ = ["read_galaxies", "read_systems", "write_figure", "write_rows", "write_rows_and_figure"]
 
 _PAIR_COLUMNS = {"flux_ratio": "", "dx": "arcsec", "dy": "arcsec"}
 _WIDEST = 10.0  # arcsec; what is wider is no unresolved pair for any survey
@@ -144,6 +144,9 @@ def write_rows(rows: Sequence[dict[str, Any]], path: Path, made_with: dict[str, 
     write_table(table, path)
 
 
+FORMATS = (".png", ".pdf", ".svg")
+"""Suffixes of figures."""
+
 _NO_DATE: dict[str, dict[str, Any]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 
@@ -167,6 +170,47 @@ def write_figure(figure: Figure, path: Path) -> None:
     InputError
         If the suffix is of no such format.
     """
-    if path.suffix not in (".png", ".pdf", ".svg"):
+    if path.suffix not in FORMATS:
         raise InputError("must end in .png, .pdf or .svg", key="plot", value=path)
     write_whole(path, lambda part: figure.savefig(part, dpi=160, metadata=_NO_DATE.get(path.suffix, {})))
+
+
+def write_rows_and_figure(
+    rows: Sequence[dict[str, Any]],
+    table: Path | None,
+    draw: Callable[[], Figure],
+    picture: Path | None,
+    made_with: dict[str, Any] | None = None,
+) -> None:
+    """Rows as a table (ECSV) and what is drawn of them as a figure; neither where one of the files cannot be.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        As `write_rows` takes them.
+    table, picture : Path or None
+        Files to write; none where not given.
+    draw : callable
+        Gives the figure, where there is one to write.
+    made_with : dict, optional
+        Models, options and versions, for the head of the table.
+
+    Returns
+    -------
+    None
+        The result is the files.
+
+    Raises
+    ------
+    InputError
+        If one cannot be written.
+    """
+    if picture is not None and picture.suffix not in FORMATS:
+        raise InputError(f"must end in {', '.join(FORMATS)}", key="plot", value=picture)
+    for path in (table, picture):
+        if path is not None and not path.parent.is_dir():
+            raise InputError("cannot be written (No such folder)", key="output", value=path)
+    if table is not None:
+        write_rows(rows, table, made_with)
+    if picture is not None:
+        write_figure(draw(), picture)

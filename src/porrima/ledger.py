@@ -6,21 +6,19 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from porrima.budget import CUTS
-from porrima.errors import InputError
-from porrima.io import write_figure, write_rows
+from porrima.io import write_rows_and_figure
 from porrima.shares import GROUPS
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from matplotlib.figure import Figure
 
     from porrima.budget import Budget
     from porrima.galaxies import Galaxies
     from porrima.shares import Interval, MagnitudeBin, Share
 
 __all__ = ["BUDGET_COLUMNS", "budget_answer", "budget_lines", "header_of", "write_budget"]
-
-FORMATS = (".png", ".pdf", ".svg")
-"""Endings that a figure may have."""
 
 _FEWEST_DIGITS = 1e-12  # a bias below it is the rounding of 0
 
@@ -221,19 +219,15 @@ def write_budget(answer: dict[str, Any], table: Path | None, picture: Path | Non
     InputError
         If one cannot be written.
     """
-    if picture is not None and picture.suffix not in FORMATS:
-        raise InputError(f"must end in {', '.join(FORMATS)}", key="plot", value=picture)
-    for path in (table, picture):  # before either is written
-        if path is not None and not path.parent.is_dir():
-            raise InputError("cannot be written (No such folder)", key="output", value=path)
-    if table is not None:
-        empty = {"required": math.nan, "verdict": ""}
-        rows = [
-            {key: empty.get(key, math.nan) if value is None else value for key, value in row.items()}
-            for row in answer["shares"]
-        ]
-        write_rows(rows, table)
-    if picture is not None:
+
+    def draw() -> Figure:
         from porrima.diagrams import budget_shares  # noqa: PLC0415  (slow to import, where used)
 
-        write_figure(budget_shares(answer), picture)
+        return budget_shares(answer)
+
+    empty = {"required": math.nan, "verdict": ""}
+    rows = [
+        {key: empty.get(key, math.nan) if value is None else value for key, value in row.items()}
+        for row in answer["shares"]
+    ]
+    write_rows_and_figure(rows, table, draw, picture)

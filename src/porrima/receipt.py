@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from porrima.errors import InputError
-from porrima.io import write_figure, write_rows
+from porrima.io import write_rows_and_figure
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from matplotlib.figure import Figure
 
 __all__ = ["CORRECT_COLUMNS", "correct_header", "correct_lines", "write_correction"]
 
@@ -28,8 +29,6 @@ CORRECT_COLUMNS = [
     "measurement",
 ]
 """Heads of the table for the terminal."""
-
-_FORMATS = (".png", ".pdf", ".svg")
 
 
 def correct_lines(answer: dict[str, Any]) -> list[list[Any]]:
@@ -121,16 +120,12 @@ def write_correction(answer: dict[str, Any], table: Path | None, picture: Path |
     InputError
         If one cannot be written.
     """
-    if picture is not None and picture.suffix not in _FORMATS:
-        raise InputError(f"must end in {', '.join(_FORMATS)}", key="plot", value=picture)
-    for path in (table, picture):  # before either is written
-        if path is not None and not path.parent.is_dir():
-            raise InputError("cannot be written (No such folder)", key="output", value=path)
-    if table is not None:
-        rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in answer["values"]]
-        made_with = {key: value for key, value in answer.items() if not isinstance(value, list)}
-        write_rows(rows, table, made_with)
-    if picture is not None:
+
+    def draw() -> Figure:
         from porrima.diagrams import corrections  # noqa: PLC0415  (slow to import, where used)
 
-        write_figure(corrections(answer), picture)
+        return corrections(answer)
+
+    rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in answer["values"]]
+    made_with = {key: value for key, value in answer.items() if not isinstance(value, list)}
+    write_rows_and_figure(rows, table, draw, picture, made_with)
