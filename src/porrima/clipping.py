@@ -17,7 +17,7 @@ from scipy.special import ndtr
 from porrima.clip import Noise, OwnShape, score, shape_grid
 from porrima.errors import InputError
 from porrima.integrals import separation_moments, separations_below, starts_of_mass_ratios
-from porrima.kept import cell_moments, kept_cells
+from porrima.kept import cell_moments, kept_cells, mass_ratio_rule
 from porrima.photometry import magnitude_on_track
 from porrima.screen import FOUR_Y, SQUARE, flux_ratio_of, magnitude_nodes
 
@@ -240,16 +240,10 @@ def _count(  # type: ignore[no-untyped-def]
             primary = magnitude_on_track(
                 grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
             )
-            g = exponent[s] + 1.0
-            first = min(max(dark_below / mass[s], q_min[s]), q_max[s])
-            norm = (q_max[s] ** g - q_min[s] ** g) / g if abs(g) > 1e-9 else math.log(q_max[s] / q_min[s])
-            one, last = not math.isnan(given[s]), math.log(q_max[s])
-            span, nodes, dark = last - math.log(first), intervals + 1, 1.0
-            if one:
-                last, span, nodes = 0.0, -math.log(given[s]), 1 if given[s] * mass[s] >= dark_below else 0
-            elif span == 0.0:
-                nodes = 0
-            h = span / intervals
+            g, norm, last, span, nodes = mass_ratio_rule(
+                mass[s], dark_below, q_min[s], q_max[s], exponent[s], given[s], intervals
+            )
+            one, dark, h = not math.isnan(given[s]), 1.0, span / intervals
             for k in range(nodes):
                 log_q = h * k - span + last
                 magnitude = magnitude_on_track(

@@ -17,7 +17,7 @@ from numba import njit, prange
 from scipy.interpolate import CubicSpline
 from scipy.special import log_ndtr, logsumexp
 
-from porrima.kept import joint_powers
+from porrima.kept import joint_powers, mass_ratio_rule
 from porrima.moments import ORDER
 from porrima.orbits import projection_nodes
 from porrima.photometry import magnitude_on_track
@@ -334,17 +334,9 @@ def _coefficients(  # type: ignore[no-untyped-def]
         )
         out[:, s, :] = 0.0
         out[:, s, 0] = 1.0
-        g = exponent[s] + 1.0
-        first = min(max(dark_below / mass[s], q_min[s]), q_max[s])  # below it companions are dark
-        last, nodes = math.log(q_max[s]), intervals + 1
-        span = last - math.log(first)
-        if not math.isnan(given[s]):
-            nodes, last, span = 1, 0.0, -math.log(given[s])
-            if given[s] * mass[s] < dark_below:
-                continue
-        elif span == 0.0:
-            continue
-        norm = (q_max[s] ** g - q_min[s] ** g) / g if abs(g) > 1e-9 else math.log(q_max[s] / q_min[s])
+        g, norm, last, span, nodes = mass_ratio_rule(
+            mass[s], dark_below, q_min[s], q_max[s], exponent[s], given[s], intervals
+        )
         h = span / intervals
         for k in range(nodes):
             log_q = h * k - span + last

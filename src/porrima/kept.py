@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
-__all__ = ["cell_moments", "coarse_nodes", "joint_powers", "kept_cells", "row_of_scores"]
+__all__ = ["cell_moments", "coarse_nodes", "joint_powers", "kept_cells", "mass_ratio_rule", "row_of_scores"]
 
 _ROWS = 512  # whose orbits are in memory at a time
 _SURE = 8.0  # normal deviates beyond which nothing, or everything, is kept
@@ -210,6 +210,22 @@ def _add(weight, value, first, last, mean, lean, cells, below, kept, out):  # ty
         power *= value
 
 
+@njit(inline="always")
+def mass_ratio_rule(mass, dark_below, q_min, q_max, exponent, given, intervals):  # type: ignore[no-untyped-def]
+    """Simpson's rule in ln q from 1, or from q_max, down to where companions of one star are dark: the exponent of q in
+    the density over ln q, its norm, ln of the last node, the span, and how many nodes there are: one where q is given.
+    """
+    g = exponent + 1.0
+    norm = (q_max**g - q_min**g) / g if abs(g) > 1e-9 else math.log(q_max / q_min)
+    last, nodes = math.log(q_max), intervals + 1
+    span = last - math.log(min(max(dark_below / mass, q_min), q_max))
+    if not math.isnan(given):
+        last, span, nodes = 0.0, -math.log(given), 1 if given * mass >= dark_below else 0
+    elif span == 0.0:
+        nodes = 0
+    return g, norm, last, span, nodes
+
+
 @njit(cache=True, parallel=True)
 def _joint(  # type: ignore[no-untyped-def]
     grid, log_mass_min, dark_below, index, weight, mass, q_min, q_max, exponent, given, intervals, four_y, square,
@@ -224,16 +240,10 @@ def _joint(  # type: ignore[no-untyped-def]
         primary = magnitude_on_track(
             grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
         )
-        g = exponent[s] + 1.0
-        first = min(max(dark_below / mass[s], q_min[s]), q_max[s])
-        norm = (q_max[s] ** g - q_min[s] ** g) / g if abs(g) > 1e-9 else math.log(q_max[s] / q_min[s])
-        one, last = not math.isnan(given[s]), math.log(q_max[s])
-        span, nodes, dark = last - math.log(first), intervals + 1, 1.0
-        if one:
-            last, span, nodes = 0.0, -math.log(given[s]), 1 if given[s] * mass[s] >= dark_below else 0
-        elif span == 0.0:
-            nodes = 0
-        h = span / intervals
+        g, norm, last, span, nodes = mass_ratio_rule(
+            mass[s], dark_below, q_min[s], q_max[s], exponent[s], given[s], intervals
+        )
+        one, dark, h = not math.isnan(given[s]), 1.0, span / intervals
         for k in range(nodes + 1):  # the last for companions that are dark
             log_q, is_dark = h * k - span + last, k == nodes
             magnitude = magnitude_on_track(
