@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
 
 import numpy as np
 
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int64]
 
 __all__ = [
-    "CompanionLaw", "MassRangeWarning", "MultiplicityModel", "RowErrors", "multiplicity_scale", "warn_of_masses",
+    "CompanionLaw", "MassRangeWarning", "MultiplicityModel", "RowErrors", "check_option", "multiplicity_scale",
+    "warn_of_masses",
 ]  # fmt: skip
 
 
@@ -211,6 +212,30 @@ class MultiplicityModel(Protocol):
 
     def companions(self, mass: FloatArray, metallicity: FloatArray | None = None) -> CompanionLaw:
         """Companions of primaries, (n,) float array: mass in M_sun, [M/H] in dex, the Sun's where not given."""
+
+
+def check_option(key: str, value: str, names: Any) -> None:
+    """Nothing, where an option of a model is one of those there are.
+
+    Parameters
+    ----------
+    key, value : str
+        Name of the option, and what a user gives.
+    names : type
+        A ``Literal`` of those there are.
+
+    Returns
+    -------
+    None
+        The check has no result.
+
+    Raises
+    ------
+    ValueError
+        If it is another one.
+    """
+    if value not in get_args(names):
+        raise ValueError(f"{key} must be one of {', '.join(get_args(names))}, got {value}")
 
 
 def warn_of_masses(mass: FloatArray, mass_range: tuple[float, float], name: str) -> None:

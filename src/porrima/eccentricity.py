@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 __all__ = [
-    "NODES", "Eccentricity", "check_eccentricity", "eccentric", "eccentricity_index", "largest_eccentricity",
+    "NODES", "Eccentricity", "eccentric", "eccentricity_index", "largest_eccentricity",
     "log_period", "mean_eccentricity", "orbit_nodes",
 ]  # fmt: skip
 
@@ -35,28 +35,6 @@ _FINE = 64  # points in the eccentricity, and in the eccentric anomaly, of the d
 _PERIOD_STEP = 0.25  # dex, to which periods are rounded so that classes share their nodes
 _WIDTH_STEP = 0.02  # dex, likewise for the widths of narrow classes, so that they share tables of separations
 _LOG_YEAR = float(np.log10(365.25))
-
-
-def check_eccentricity(name: str) -> None:
-    """Nothing, where the name is one of `Eccentricity`.
-
-    Parameters
-    ----------
-    name : str
-        As a user gives it.
-
-    Returns
-    -------
-    None
-        The check has no result.
-
-    Raises
-    ------
-    ValueError
-        If it is another one.
-    """
-    if name not in get_args(Eccentricity):
-        raise ValueError(f"eccentricity must be one of {', '.join(get_args(Eccentricity))}, got {name}")
 
 
 def log_period(log_a: FloatArray, total_mass: FloatArray) -> FloatArray:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy.special import ndtr
 
-from porrima.companions import CompanionLaw, RowErrors, warn_of_masses
-from porrima.eccentricity import Eccentricity, check_eccentricity, eccentric
+from porrima.companions import CompanionLaw, RowErrors, check_option, warn_of_masses
+from porrima.eccentricity import Eccentricity, eccentric
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -189,28 +189,6 @@ def apply_metallicity(
     )
 
 
-def check_metallicity(name: str) -> None:
-    """Nothing, where the name is one of `METALLICITY`.
-
-    Parameters
-    ----------
-    name : str
-        As a user gives it.
-
-    Returns
-    -------
-    None
-        The check has no result.
-
-    Raises
-    ------
-    ValueError
-        If it is another one.
-    """
-    if name not in get_args(MetallicityTrend):
-        raise ValueError(f"metallicity must be one of {', '.join(METALLICITY)}, got {name}")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MoeDiStefano2017:
     r"""Periods, mass ratios with twins and eccentricities of main-sequence pairs by Moe & Di Stefano (2017).
@@ -250,8 +228,8 @@ class MoeDiStefano2017:
     metallicity: MetallicityTrend = "none"
 
     def __post_init__(self) -> None:
-        check_eccentricity(self.eccentricity)
-        check_metallicity(self.metallicity)
+        check_option("eccentricity", self.eccentricity, Eccentricity)
+        check_option("metallicity", self.metallicity, MetallicityTrend)
 
     @property
     def mass_range(self) -> tuple[float, float]:

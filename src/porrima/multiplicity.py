@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from porrima.companions import CompanionLaw, MultiplicityModel, RowErrors, multiplicity_scale
-from porrima.eccentricity import Eccentricity, check_eccentricity, eccentric
+from porrima.companions import CompanionLaw, MultiplicityModel, RowErrors, check_option, multiplicity_scale
+from porrima.eccentricity import Eccentricity, eccentric
 from porrima.moe import MoeDiStefano2017
 from porrima.photometry import check_masses
 from porrima.published import Offner2023, Raghavan2010, SusemiehlMeyer2022, Winters2019
@@ -119,7 +119,7 @@ class DucheneKraus2013:
             raise ValueError(f"scatter_scale must be positive and finite, got {self.scatter_scale}")
         if not 0 < self.mass_ratio_min < 1:
             raise ValueError(f"mass_ratio_min must be in (0, 1), got {self.mass_ratio_min}")
-        check_eccentricity(self.eccentricity)
+        check_option("eccentricity", self.eccentricity, Eccentricity)
 
     @property
     def mass_range(self) -> tuple[float, float]:

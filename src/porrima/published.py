@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from porrima.companions import CompanionLaw, RowErrors, warn_of_masses
-from porrima.eccentricity import Eccentricity, check_eccentricity, eccentric, orbit_nodes
-from porrima.moe import MetallicityTrend, apply_metallicity, check_metallicity
+from porrima.companions import CompanionLaw, RowErrors, check_option, warn_of_masses
+from porrima.eccentricity import Eccentricity, eccentric, orbit_nodes
+from porrima.moe import MetallicityTrend, apply_metallicity
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -56,8 +56,8 @@ class _LogNormals:
             raise ValueError(f"gap_rule must be nearest or interpolated, got {self.gap_rule}")
         if not 0 < self.mass_ratio_min < 1:
             raise ValueError(f"mass_ratio_min must be in (0, 1), got {self.mass_ratio_min}")
-        check_eccentricity(self.eccentricity)
-        check_metallicity(self.metallicity)
+        check_option("eccentricity", self.eccentricity, Eccentricity)
+        check_option("metallicity", self.metallicity, MetallicityTrend)
 
     @property
     def mass_range(self) -> tuple[float, float]:
