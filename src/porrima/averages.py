@@ -92,7 +92,8 @@ class PopulationMoments:
         stack; j = 0 counts pairs.  Dimensionless.  Of pairs alone, where there are triples.
     relative_error : (k,) float array
         Of the quadrature: the largest estimate among all powers with j and k above 0 and the mean
-        moments, with a selection among x and x² alone; dimensionless.
+        moments, with a selection among x and x² alone; with triples at least the standard error of x or x² by them;
+        dimensionless.
     triples : TripleMoments or None
         The part of triples in the moments; None where there are none.
 
@@ -197,26 +198,30 @@ def population_moments(
     spread = np.ones((kept.size, 1)) if equal else (mean_w2 / mean_w**2)[:, None]
     covariance = products - mean[:, :, None] * weighted[:, None, :] - weighted[:, :, None] * mean[:, None, :]
     covariance += spread[:, :, None] * mean[:, :, None] * mean[:, None, :]
+    mean_x = powers[:, 1, 1] * population.cut**2 / 4 + (0.0 if part is None else _mean_x(part))
+    mean_x2 = powers[:, 2, 2] * population.cut**4 / 16 + (0.0 if part is None else _mean_x2(part))
     error = _relative_error(powers, _square(coarse, kept * mean_w), integrals.joint is None)
+    if triples is not None:
+        total = np.stack([kept * mean_w * mean_x, kept * mean_w**2 * mean_x2])
+        own = np.divide(triples.error, total, out=np.zeros_like(total), where=total > 0)
+        error = np.maximum(error, own.max(axis=0))
     return PopulationMoments(
         cut=population.cut,
         binary_fraction=pairs / fraction.size,
         **_shares(counts, kept, fraction.size, alone.sum()),
-        mean_x=powers[:, 1, 1] * population.cut**2 / 4 + (0.0 if part is None else _mean_x(part)),
-        mean_x2=powers[:, 2, 2] * population.cut**4 / 16 + (0.0 if part is None else _mean_x2(part)),
+        mean_x=mean_x,
+        mean_x2=mean_x2,
         effective_share=1 / spread[:, 0],
         mean=mean,
         shift=spread * mean - weighted,
         covariance=covariance,
         powers=powers,
-        relative_error=error if triples is None else np.maximum(error, triples.spread),
+        relative_error=error,
         triples=part,
     )
 
 
-def _count_triples(
-    triples: TripleSums, first: FloatArray, second: FloatArray, counts: FloatArray
-) -> None:
+def _count_triples(triples: TripleSums, first: FloatArray, second: FloatArray, counts: FloatArray) -> None:
     """Add triples, and the weight lost to them, to the sums over pairs of `_star_sums` and `_star_counts`."""
     lost = triples.number - triples.kept
     first[:, -1] += triples.lost[0]

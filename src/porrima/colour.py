@@ -311,6 +311,11 @@ def colour_bias(
     bias : ColourBias
         For k binary fractions, dimensionless.
 
+    Raises
+    ------
+    InputError
+        If there are triples.
+
     Notes
     -----
     With s the shape of a single star behind the PSF, from its own photons, a pair of primary A and companion B has,
@@ -321,6 +326,8 @@ def colour_bias(
     two spectra; the term with both colour and separation, of order :math:`\eta` times 0.1, is left out.
     """
     stars, law = population.stars, population.law
+    if np.any(law.is_triple):
+        raise InputError("must be off for the colour of companions", key="multiplicity.triples", value=True)
     mass = np.clip(stars.mass, *MainSequence().mass_range)
     place = MainSequence().tracks(mass, stars.metallicity, stars.log_age, "i")
     shapes = [

@@ -215,7 +215,9 @@ def _uniform_fractions(seed, first, fractions):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True, _nrt=False, cache=True)
-def _draw_stack(tables, member, screen, loss, block, room, seed, stack, n_stars, fraction, scale, sums, listed):  # type: ignore[no-untyped-def]
+def _draw_stack(  # type: ignore[no-untyped-def]
+    tables, member, screen, loss, block, room, seed, stack, n_stars, fraction, scale, sums, listed
+):
     """Sum of the weights of one stack, with those of its moments, in the unit of length, in `sums`.
 
     Its systems are listed where `listed` has rows.

@@ -44,7 +44,7 @@ _HIERARCHY, _OUTER, _INNER, _PHASES, _ANGLE, _TURN, _SCALE = 5, 6, 7, 8, 10, 11,
 _DIMENSIONS = 13  # after the star's: two classes, ratio of the axes, two mass ratios, and the above
 _TURNS = 24  # on the sky, each seen in a mirror too: exact up to order 16
 _ORDERS = np.sum(INDICES, axis=1)
-_SIZES = [INDICES.index((n, 0)) for n in range(2, ORDER + 1, 2)]
+_EVEN_SUMS = [(n, m) for n in range(2, ORDER + 1) for m in range(n, ORDER + 1, 2)]
 
 
 class _Orbits(NamedTuple):
@@ -83,8 +83,8 @@ class TripleSums:
         Kernel moments of those kept times the weight, or its square, in arcsec^(a+b).
     product : (k, n_moment, n_moment) float array
         Products of two moments times the square of the weight, in arcsec^(a+b+c+d).
-    spread : (k,) float array
-        Relative standard error of the points: the largest among x, x² and the mean moments, dimensionless.
+    error : (2, k) float array
+        Standard errors of the sums of x and of x², by the scrambles, in arcsec² and arcsec⁴.
     kernel : (n, n_moment) float array
         Moments of some of the triples that are kept, in arcsec^(a+b).
     share : (k, n) float array
@@ -96,7 +96,7 @@ class TripleSums:
     lost: FloatArray
     mean: FloatArray
     product: FloatArray
-    spread: FloatArray
+    error: FloatArray
     kernel: FloatArray
     share: FloatArray
 
@@ -111,8 +111,8 @@ class TripleAverages:
         Multiplicity fraction, in [0, 1].
     columns : (n_group, n_column) float array
         Number; kept; weight and its square lost; mean moments with either weight; products; as `TripleSums` has them.
-    errors : (n_scramble, n_group, 5) float array
-        Mean moments of orders 2 to 8 and mean x² by each scramble, in arcsec^(a+b).
+    errors : (n_scramble, n_group, 2) float array
+        x and x² by each scramble, in arcsec² and arcsec⁴.
     kernel : (n, n_moment) float array
         Moments of some triples that are kept, in arcsec^(a+b).
     group : (n,) int array
@@ -144,15 +144,13 @@ class TripleAverages:
         multiple = np.minimum(1.0, scale[:, None] * self.fraction)
         total, n = multiple @ self.columns, N_MOMENTS
         each = multiple @ self.errors
-        mean = each.mean(axis=0)
-        error = each.std(axis=0, ddof=1) / np.sqrt(len(each))
         return TripleSums(
             number=total[:, 0],
             kept=total[:, 1],
             lost=total[:, 2:4].T,
             mean=total[:, 4 : 4 + 2 * n].reshape(-1, 2, n).swapaxes(0, 1),
             product=total[:, 4 + 2 * n :].reshape(-1, n, n),
-            spread=np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0).max(axis=1),
+            error=each.std(axis=0, ddof=1).T / np.sqrt(len(each)),
             kernel=self.kernel,
             share=multiple[:, self.group] * self.share,
         )
@@ -184,7 +182,8 @@ def triple_averages(population: Population) -> TripleAverages | None:
         return None
     rows = rows[np.argsort(law.multiplicity_fraction[rows], kind="stable")]
     start, fraction = _groups(law.multiplicity_fraction[rows], number[rows])
-    running, stable, parts = np.cumsum(number[rows]), _stable_share(law), []
+    running, stable = np.cumsum(number[rows]), _stable_share(law)
+    columns, samples = [], []
     for scramble in range(_SCRAMBLES):
         point = qmc.Sobol(_DIMENSIONS + 1, rng=_SEED + scramble).random_base2(_POINTS)
         point = point[np.argsort(point[:, 0])]
@@ -192,10 +191,9 @@ def triple_averages(population: Population) -> TripleAverages | None:
         triples = _triples(population, rows[place], point[:, 1:], stable)
         triples.weight[:] *= running[-1] / place.size
         group = np.searchsorted(start, place, side="right") - 1
-        columns = _columns(triples, population.weight[rows[place]], group, fraction.size)
-        parts.append((columns, *_some(triples, group, point[:, _TURN + 1])))
-    columns, *sample = (list(part) for part in zip(*parts, strict=True))
-    kernel, share, group = (np.concatenate(part) for part in sample)
+        columns.append(_columns(triples, population.weight[rows[place]], group, fraction.size))
+        samples.append(_some(triples, group, point[:, _TURN + 1]))
+    kernel, share, group = (np.concatenate(part) for part in zip(*samples, strict=True))
     mean = np.mean(columns, axis=0)
     found = np.bincount(group, share, fraction.size)
     share *= np.divide(mean[:, 1], found, out=np.zeros_like(found), where=found > 0)[group]
@@ -316,7 +314,7 @@ def _sources(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Flux shares and places of the sources, (n, 3), in arcsec if the outer axis were 1 au.
 
-    The inner pair stands about its centre of mass, with the third star at the end of the outer orbit, or A at its start.
+    The inner pair stands about its centre of mass, the third star at the end of the outer orbit, or A at its start.
     """
     stars, tracks = population.stars, population.tracks
     d_out = _projected(population, u[:, _OUTER], u[:, _PHASES]) / stars.distance[row]
@@ -356,7 +354,7 @@ def _columns(triples: _Triples, weight: FloatArray, group: IntArray, n_group: in
         out[k, 4 : 4 + N_MOMENTS] = np.sum(first[mine][:, _ORDERS] * kernel, axis=0)
         out[k, 4 + N_MOMENTS : 4 + 2 * N_MOMENTS] = np.sum(second[mine][:, _ORDERS] * kernel, axis=0)
         product = out[k, 4 + 2 * N_MOMENTS :].reshape(N_MOMENTS, N_MOMENTS)
-        for n, m in ((n, m) for n in range(2, ORDER + 1) for m in range(n, ORDER + 1, 2)):
+        for n, m in _EVEN_SUMS:
             one, two = orders[n - 2], orders[m - 2]
             block = kernel[:, one].T @ (second[mine, n + m, None] * kernel[:, two])
             product[np.ix_(one, two)], product[np.ix_(two, one)] = block, block.T
@@ -372,9 +370,7 @@ def _with_lost(columns: FloatArray, number: FloatArray, weight: FloatArray, star
     return out
 
 
-def _some(
-    triples: _Triples, group: IntArray, u: FloatArray
-) -> tuple[FloatArray, FloatArray, IntArray]:
+def _some(triples: _Triples, group: IntArray, u: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     """Some of the triples that are kept, turned at random: their moments, what each counts, and their groups."""
     every = slice(None, None, max(1, u.size * _SCRAMBLES // _SAMPLE))
     turn = (u[every] * 2 * _TURNS).astype(int)
@@ -384,12 +380,12 @@ def _some(
 
 
 def _sizes(columns: FloatArray) -> FloatArray:
-    """Mean moments of orders 2 to 8 along x, and mean x², of each group, (n_group, 5)."""
-    mean = columns[:, 4 : 4 + N_MOMENTS] @ _rotations().mean(axis=0).T
+    """x and x² of each group, (n_group, 2)."""
+    mean = columns[:, 4 : 4 + N_MOMENTS]
     product = columns[:, 4 + 2 * N_MOMENTS :].reshape(-1, N_MOMENTS, N_MOMENTS)
     xx, yy = INDICES.index((2, 0)), INDICES.index((0, 2))
     square = product[:, xx, xx] + 2 * product[:, xx, yy] + product[:, yy, yy]
-    return np.concatenate([mean[:, _SIZES], square[:, None]], axis=1)
+    return np.stack([mean[:, xx] + mean[:, yy], square], axis=1)
 
 
 @cache

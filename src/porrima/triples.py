@@ -192,7 +192,7 @@ def _draw_triple(tables, member, row, key_low, key_high, low, high, pair, three)
 
 @njit(_nrt=False)
 def draw_triples(tables, member, block, room, key_low, key_high, low, high, first):  # type: ignore[no-untyped-def]
-    """Put triples where the stars of a block have them: in its rows their largest separation, and a pair without light."""
+    """Put triples where a block has their stars: its rows get their widest separation, and a pair without light."""
     for lane in range(LANES):
         row = bits(block[NUMBER + lane])
         if bits(member[row, _MEMBERS]) > 0:
