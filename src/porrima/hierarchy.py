@@ -95,6 +95,10 @@ def with_triples(law: CompanionLaw, share: FloatArray) -> CompanionLaw:
     ------
     ValueError
         If a share lies outside [0, 1], or the orbits of a star are too alike for a stable hierarchy.
+
+    References
+    ----------
+    Tokovinin2014, Mardling2001
     """
     wrong = ~((share >= 0) & (share <= 1))
     if np.any(wrong):
