@@ -1,6 +1,6 @@
 """Triple stars: the engine, the quadrature and a third account in plain numpy, which shares nothing with either."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from porrima.images import measure_stack
 from porrima.integrals import integrate
 from porrima.moments import INDICES
 from porrima.multiplicity import MULTIPLICITY, DucheneKraus2013
+from porrima.pairs import tables_of
 from porrima.photometry import PHOTOMETRY, flux_ratio
 from porrima.prediction import predict
 from porrima.psf import psf_from_name
@@ -25,6 +26,7 @@ from porrima.shapes import Adaptive, estimator_from_name
 from porrima.stack import draw_stacks, draw_systems
 from porrima.stars import Stars
 from porrima.systems import Population, Systems
+from porrima.triples import _draw_triple, _hierarchy, member_rows
 from statistics_helpers import assert_within_sigma
 
 LIGHT = PHOTOMETRY["main-sequence"]
@@ -167,6 +169,82 @@ def test_the_engine_agrees_with_the_quadrature(heavy, model, weight):
         difference = np.abs(products.mean(axis=0) - known.covariance[0] / n_stars)
         too_far = difference > 5 * error + slack * np.outer(scale, scale)
         assert not np.any(too_far[np.ix_(few, few)])
+
+
+@dataclass(frozen=True)
+class AllTriples:
+    """Every multiple star is a triple, with orbits near the cut and near the limit of stability."""
+
+    projection = "isotropic"
+
+    def companions(self, mass, metallicity=None):
+        law = DucheneKraus2013(gap_rule="solar").companions(mass)
+        law = replace(law, log_a_sigma=np.full(mass.size, 0.5), log_a=np.full(mass.size, 1.0))
+        return with_triples(law, np.ones(mass.size))
+
+
+def test_engine_and_quadrature_agree_to_a_thousandth_where_all_are_triples(heavy, monkeypatch):
+    """Fine enough to tell limits of stability a tenth apart."""
+    monkeypatch.setattr(triple_averages, "_POINTS", 15)
+    population = Population.of(heavy, multiplicity=AllTriples(), photometry=LIGHT)
+    n_stars, n_stacks = 400, 15_000
+    known = population_moments(population, integrate(population), np.array([1.0]))
+    drawn = draw_stacks(
+        population, n_stars=n_stars, binary_fraction=1.0, seed=21, first=0, last=n_stacks
+    ).moments.values
+    even = [k for k, (a, b) in enumerate(INDICES) if a + b in (2, 4) and a % 2 == 0]
+    error = np.sqrt(np.diag(known.covariance[0]) / n_stars / n_stacks)[even]
+    of_points = known.relative_error[0] * known.mean[0, even]
+    assert np.all(error[:1] < 2e-3 * known.mean[0, even[:1]])
+    assert_within_sigma(drawn.mean(axis=0)[even], known.mean[0, even], np.hypot(error, of_points))
+
+
+def test_orbits_are_about_centres_of_mass_stable_and_turned_independently(heavy):
+    """Of single triples of the engine, with the axes and masses that it drew for them."""
+    population = Population.of(heavy, multiplicity=AllTriples(), photometry=LIGHT)
+    tables, member, n = tables_of(population), member_rows(population), 4000
+    rows = np.flatnonzero(population.law.is_triple)
+    three, found = np.zeros(6), []
+    for pair in range(n):
+        key = (
+            tables,
+            member,
+            int(rows[pair % rows.size]),
+            np.uint32(3),
+            np.uint32(0),
+            np.uint32(0),
+            np.uint32(0),
+        )
+        outer, inner, m_outer, m_inner, around = _hierarchy(*key, np.uint32(pair))
+        widest = _draw_triple(*key, np.uint32(pair), three)
+        own = np.log2(population.stars.mass[key[2]])
+        found.append([outer, inner, m_outer - own, m_inner - own, around, widest, *three])
+    outer, inner, q_outer, q_inner = 2.0 ** np.array(found).T[:4]
+    around, widest = np.array(found).T[4] > 0, np.array(found).T[5]
+    _, x1, y1, _, x2, y2 = np.array(found).T[6:]
+    first, second = (
+        x1 + 1j * y1,
+        x2 + 1j * y2,
+    )  # of the third star or B, and of the companion in the inner pair
+    heavier = np.where(around, 1.0, q_outer)
+    share = q_inner / (heavier + q_inner)
+    narrow = np.where(around, second, second - first)
+    centre = np.where(around, share * narrow, first + share * narrow)
+    wide = np.where(around, first - centre, centre)
+    third = np.where(around, q_outer, 1.0) / (heavier + q_inner)
+    assert np.all(outer / inner > 2.8 * (1 + third) ** 0.4 * (1 - 1e-5))
+    assert np.all(q_inner <= heavier * (1 + 1e-5))
+    at = np.max(np.abs([first, second, first - second]), axis=0)
+    np.testing.assert_allclose(widest, at, rtol=1e-5)
+    for vector, axis in ((wide, outer), (narrow, inner)):
+        ratio = (np.abs(vector) / axis) ** 2
+        assert ratio.max() < 1 + 1e-3
+        assert_within_sigma(ratio.mean(), 2 / 3, ratio.std() / np.sqrt(n))
+    for kind in (around, ~around):
+        cosine = (wide * narrow.conj() / np.abs(wide * narrow)).real[kind]
+        assert_within_sigma(cosine.mean(), 0.0, cosine.std() / np.sqrt(cosine.size))
+    share = INNER_AROUND_PRIMARY
+    assert_within_sigma(around.mean(), share, np.sqrt(share * (1 - share) / n))
 
 
 @pytest.mark.parametrize("psf", ["psf1", "optical1"])
