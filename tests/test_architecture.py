@@ -89,8 +89,8 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
         "stars", "systems",
     },
     "colour": {
-        "errors", "integrals", "passbands", "photometry", "psf", "psf_files", "reach", "roman", "shapes", "spectra",
-        "stars", "systems",
+        "companions", "errors", "integrals", "passbands", "photometry", "psf", "psf_files", "reach", "roman", "shapes",
+        "spectra", "stars", "systems",
     },
     "galaxies": {"errors", "units"},
     "shear": {"averages", "errors", "galaxies", "moments", "prediction", "shapes"},

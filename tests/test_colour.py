@@ -10,6 +10,7 @@ from porrima.passbands import black_body, photon_averages
 from porrima.photometry import PHOTOMETRY, flux_ratio, magnitudes
 from porrima.prediction import integrate, population_moments
 from porrima.psf import psf_from_name
+from porrima.selection import SelectionTable
 from porrima.shapes import Adaptive, Plain
 from porrima.spectra import Light
 from porrima.stars import Stars
@@ -194,3 +195,90 @@ def test_a_chromatic_stanza_has_colours_too(tmp_path):
     file.write_text("psf: {type: ChromaticOpticalPSF, lam: 800, diam: 1.2}\n")
     waves = chromatic(str(file), Adaptive(), "roman_F062")
     assert waves.slope[2] == pytest.approx(2.0, abs=0.05)
+
+
+def mixed(population, share, **of_second):
+    """Every star with two classes of companions, the second with other figures."""
+    n = len(population.stars)
+    star = np.repeat(np.arange(n), 2)
+    second = np.arange(2 * n) % 2 == 1
+    law = population.law.take(star)
+    law = replace(law, star=star, share=np.where(second, share, 1 - share))
+    law = replace(law, **{k: np.where(second, v, getattr(law, k)) for k, v in of_second.items()})
+    tracks = population.tracks
+    return replace(
+        population,
+        stars=population.stars.take(star),
+        law=law,
+        tracks=replace(tracks, index=tracks.index[star], weight=tracks.weight[star]),
+        weight=population.weight[star],
+    )
+
+
+def test_two_classes_alike_are_one(in_vis, waves, integrals):
+    one = colour_bias(in_vis, waves, integrals, np.array([0.35]))
+    two = mixed(in_vis, 0.3)
+    found = colour_bias(two, waves, integrate(two), np.array([0.35]))
+    np.testing.assert_allclose(found.blind, one.blind, rtol=1e-12)
+    np.testing.assert_allclose(found.known, one.known, rtol=1e-12)
+
+
+@pytest.mark.parametrize("figures", [{"mass_ratio_max": 0.6}, {"mass_ratio_exponent": 3.0}])
+def test_classes_count_by_their_shares(in_vis, waves, figures):
+    parts = [mixed(in_vis, share, **figures) for share in (0.0, 0.25, 1.0)]
+    first, both, second = (colour_bias(p, waves, integrate(p)).blind[2, 0] for p in parts)
+    assert abs(second / first - 1) > 0.1
+    assert both == pytest.approx(
+        0.75 * first + 0.25 * second, rel=1e-9
+    )  # orbits, so those resolved, are the same
+
+
+def table(pair, single):
+    """Selection that rejects wide, bright pairs with a probability, and single stars with another."""
+    separation, contrast = np.array([0.003, 0.01, 0.02, 0.05]), np.array([0.0, 1.0, 2.5, 5.0])
+    wide = np.array([0.3, 0.7, 0.9, 1.0])
+    bright = np.array([1.0, 0.9, 0.5, 0.1])
+    return SelectionTable(
+        separation=separation,
+        contrast=contrast,
+        magnitude=np.array([18.5]),
+        probability=(pair * bright[:, None] * wide)[None],
+        single=np.array([single]),
+    )
+
+
+def test_a_selection_that_rejects_nothing_changes_nothing(in_vis, waves, integrals):
+    selected = replace(in_vis, selection=table(0.0, 0.0))
+    found, expected = colour_bias(selected, waves, integrate(selected)), colour_bias(in_vis, waves, integrals)
+    np.testing.assert_allclose(found.blind, expected.blind, rtol=2e-3)
+
+
+def test_a_selection_keeps_what_it_keeps_of_each_mass_ratio(in_vis, waves):
+    selected = replace(in_vis, selection=table(1.0, 0.05))
+    integrals = integrate(selected)
+    found = colour_bias(selected, waves, integrals).blind[2, 0]
+    law, mass, q = selected.law, selected.stars.mass, np.linspace(0.1, 1.0, 73)
+    steps = 0.5 * np.append(np.diff(q), 0.0) + 0.5 * np.append(0.0, np.diff(q))
+    g = law.mass_ratio_exponent + 1
+    size = photon_averages(waves.band, waves.influence[2:])[0]
+    tracks = replace(selected.tracks, magnitude=np.ascontiguousarray(size))
+    total = np.zeros(mass.size)
+    for ratio, step in zip(q, steps, strict=True):
+        given = replace(selected, law=replace(law, mass_ratio=np.full(mass.size, ratio)))
+        kept = integrate(given).kept  # of pairs of this mass ratio alone
+        f = flux_ratio(selected.tracks, mass, np.full((mass.size, 1), ratio))[:, 0]
+        own, other = (magnitudes(tracks, m[:, None])[:, 0] for m in (mass, mass * ratio))
+        change = np.where(f > 0, f / (1 + f) * (np.where(f > 0, other, 0.0) - own), 0.0)
+        total += step * g * ratio ** (g - 1) / (1 - 0.1**g) * kept * change
+    p = law.multiplicity_fraction
+    expected = np.sum(p * total) / np.sum((1 - p) * integrals.single_kept + p * integrals.kept)
+    everything = colour_bias(in_vis, waves, integrate(in_vis)).blind[2, 0]
+    assert found < 0.9 * everything
+    assert found == pytest.approx(expected, rel=0.01)
+
+
+def test_a_selection_sees_the_flux_ratios_of_the_band(population):
+    selected = replace(population, selection=table(1.0, 0.0))
+    here = in_band(selected, MODELS["photometry"], "roman_F158")
+    again, fresh = integrals_in_band(here, integrate(selected)), integrate(here)
+    np.testing.assert_allclose(again.joint, fresh.joint, rtol=1e-12)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from porrima.errors import InputError
-from porrima.integrals import coefficient_moments
+from porrima.integrals import coefficient_moments, integrate, starts_of_mass_ratios
 from porrima.passbands import black_body, passband, photon_averages
 from porrima.photometry import MainSequence, flux_ratio, magnitudes
 from porrima.psf import PSFS, psf_from_name
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from porrima.companions import CompanionLaw
     from porrima.integrals import PairIntegrals
     from porrima.passbands import Passband, Spectrum
     from porrima.photometry import MassLuminosity, Tracks
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from porrima.systems import Population
 
     FloatArray = NDArray[np.float64]
+    IntArray = NDArray[np.int64]
 
 __all__ = ["Chromatic", "ColourBias", "chromatic", "colour_bias", "in_band", "integrals_in_band"]
 
@@ -264,7 +266,7 @@ def in_band(population: Population, photometry: MassLuminosity, band: str) -> Po
 
 
 def integrals_in_band(population: Population, integrals: PairIntegrals) -> PairIntegrals:
-    """Expectations over companions with other flux ratios, of the same orbits.
+    """Expectations over companions with other flux ratios, of the same orbits; a selection sees these flux ratios.
 
     Parameters
     ----------
@@ -278,6 +280,8 @@ def integrals_in_band(population: Population, integrals: PairIntegrals) -> PairI
     integrals : PairIntegrals
         Separations as before.
     """
+    if integrals.joint is not None:
+        return integrate(population)
     return replace(integrals, coefficient=coefficient_moments(population))
 
 
@@ -294,11 +298,11 @@ def colour_bias(
     Parameters
     ----------
     population : Population
-        Of n stars, with the flux ratios of the band (`in_band`).
+        Of n rows, stars or classes of their companions, with the flux ratios of the band (`in_band`).
     chromatic : Chromatic
         Of PSF and estimator.
     integrals : PairIntegrals
-        Of the same stars: the chance that a pair is unresolved.
+        Of the same rows (`integrals_in_band`): the chance that a pair stays in the sample.
     binary_fraction : (k,) float array, optional
         Before resolved pairs leave, in [0, 1]; None for the model's own.
     spectrum : {"broad-band", "black-body"}
@@ -322,37 +326,87 @@ def colour_bias(
     for r → 0, :math:`s_A + \frac{f}{1+f}(s_B - s_A)`.  ``blind`` is the mean of the second term, ``known`` that of the
     difference from a single star on the same track that has the colour of the pair: what is left when the PSF model
     interpolates in observed colour.  The mean is over mass ratios by Simpson's rule and over stars with
-    :math:`p_i P_{unres,i}` of :math:`\sum_i (1 - p_i P_{res,i})`, as that of x.  First order in the difference of the
+    :math:`p_i P_{unres,i}` of :math:`\sum_i (1 - p_i P_{res,i})`, as that of x; classes count by their abundance, and a
+    selection by what it keeps of pairs and of single stars.  First order in the difference of the
     two spectra; the term with both colour and separation, of order :math:`\eta` times 0.1, is left out.
     """
-    stars, law = population.stars, population.law
-    if np.any(law.is_triple):
+    if np.any(population.law.is_triple):
         raise InputError("must be off for the colour of companions", key="multiplicity.triples", value=True)
-    mass = np.clip(stars.mass, *MainSequence().mass_range)
+    law, w, number = population.law, population.weight, population.abundance
+    first = starts_of_mass_ratios(law)
+    run = np.repeat(np.arange(first.size), np.diff(first, append=law.star.size))
+    pairs = _Pairs.of(population, first)
+    blind, known = _changes(pairs, chromatic, spectrum, observed or _observed(chromatic.band.name))
+    p = np.minimum(1.0, population.scale(binary_fraction)[:, None] * law.multiplicity_fraction)
+    alone = 1.0 if integrals.single_kept is None else integrals.single_kept
+    kept = (number * w * (alone - p * integrals.lost)).sum(axis=1)
+    means = [_kept_means(pairs, change, integrals, run) for change in (blind, known)]
+    of_blind, of_known = (mean @ (number * w * p).T / kept for mean in means)
+    return ColourBias(blind=of_blind, known=of_known)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Pairs:
+    """Pairs of each run of classes of one star that share their mass ratios, (n,) and (n, k)."""
+
+    stars: Stars
+    mass: FloatArray  # of the primary, in M_sun, within the photometry
+    ratio: FloatArray
+    weight: FloatArray  # of the rule over mass ratios
+    flux_ratio: FloatArray
+
+    @classmethod
+    def of(cls, population: Population, first: IntArray) -> _Pairs:
+        """Those of the runs that start at some rows."""
+        stars, tracks = population.stars.take(first), population.tracks
+        own = replace(tracks, index=tracks.index[first], weight=tracks.weight[first])
+        ratio, weight = _mass_ratios(population.law.take(first), stars.mass, tracks.dark_below)
+        return cls(
+            stars=stars,
+            mass=np.clip(stars.mass, *MainSequence().mass_range),
+            ratio=ratio,
+            weight=weight,
+            flux_ratio=flux_ratio(own, stars.mass, ratio),
+        )
+
+
+def _changes(
+    pairs: _Pairs, chromatic: Chromatic, spectrum: Spectrum, observed: tuple[str, str]
+) -> tuple[FloatArray, FloatArray]:
+    """Change of shape (3, n, k) against the primary, and against a single star of the colour of the pair."""
+    mass, ratio, stars = pairs.mass, pairs.ratio, pairs.stars
     place = MainSequence().tracks(mass, stars.metallicity, stars.log_age, "i")
     shapes = [
         replace(place, magnitude=np.ascontiguousarray(grid))
         for grid in photon_averages(chromatic.band, chromatic.influence, spectrum)
     ]
-    ratio, weight = _mass_ratios(population)
     masses = np.concatenate([mass[:, None], mass[:, None] * ratio], axis=1)
-    f = flux_ratio(population.tracks, stars.mass, ratio)
-    share = f / (1 + f)
-    own = [_of_masses(one, masses) for one in shapes]
-    added = [share * (values[:, 1:] - values[:, :1]) for values in own]
-    seen = _single_of_colour(place, mass, ratio, shapes, observed or _observed(chromatic.band.name), stars)
-    left = [values[:, :1] + change - one for values, change, one in zip(own, added, seen, strict=True)]
-    p = np.minimum(1.0, population.scale(binary_fraction)[:, None] * law.multiplicity_fraction)
-    unresolved = integrals.unresolved
-    pairs = population.weight * p * unresolved
-    kept = (population.weight * (1 - p * (1 - unresolved))).sum(axis=1)
+    share = pairs.flux_ratio / (1 + pairs.flux_ratio)
+    own = np.stack([_of_masses(one, masses) for one in shapes])
+    blind = share * (own[..., 1:] - own[..., :1])
+    single = np.stack(_single_of_colour(place, mass, ratio, shapes, observed, stars))
+    known = own[..., :1] + blind - single
+    return np.where(share > 0, blind, 0.0), np.where(share > 0, known, 0.0)
 
-    def mean(parts: list[FloatArray]) -> FloatArray:
-        each = np.stack([np.where(share > 0, part, 0.0) * weight for part in parts]).sum(axis=2)
-        averages: FloatArray = each @ pairs.T / kept
-        return averages
 
-    return ColourBias(blind=mean(added), known=mean(left))
+def _kept_means(pairs: _Pairs, change: FloatArray, integrals: PairIntegrals, run: IntArray) -> FloatArray:
+    """Expectation (3, m) of a change (3, n, k) over the companions of each class that stay, n being runs of classes.
+
+    A selection knows powers of 4 y.  The change is fitted by those from 1 to 8, which vanish for dark companions as it
+    does; what the fit leaves is taken to be kept as pairs are in the mean.
+    """
+    if integrals.joint is None:
+        of_run: FloatArray = (change * pairs.weight).sum(axis=2)
+        return of_run[:, run] * integrals.kept
+    four_y = 4 * pairs.flux_ratio / (1 + pairs.flux_ratio) ** 2
+    powers = four_y[..., None] ** np.arange(1, integrals.joint.shape[2])
+    root = np.sqrt(np.maximum(pairs.weight, 0.0))
+    inverse = np.linalg.pinv(root[..., None] * powers, rcond=1e-10)  # (n, power, k)
+    fitted = np.einsum("njk,qnk->qnj", inverse, root * change)
+    left = ((change - np.einsum("nkj,qnj->qnk", powers, fitted)) * pairs.weight).sum(axis=2)
+    means: FloatArray = np.einsum("qmj,mj->qm", fitted[:, run], integrals.joint[0, :, 1:, 0])
+    means += left[:, run] * integrals.kept
+    return means
 
 
 def _observed(band: str) -> tuple[str, str]:
@@ -365,20 +419,17 @@ def _of_masses(tracks: Tracks, mass: FloatArray) -> FloatArray:
     return np.where(np.isfinite(values), values, 0.0)
 
 
-def _mass_ratios(population: Population) -> tuple[FloatArray, FloatArray]:
+def _mass_ratios(law: CompanionLaw, mass: FloatArray, dark_below: float) -> tuple[FloatArray, FloatArray]:
     """Mass ratios (n, k) that shine and their weights, by Simpson's rule in ln q; those given are their own rule."""
-    law, mass = population.law, population.stars.mass
-    dark = population.tracks.dark_below
-    first = np.clip(dark / mass, law.mass_ratio_min, 1.0)
+    low, high = law.mass_ratio_min, law.mass_ratio_max
+    first = np.minimum(np.maximum(dark_below / mass, low), high)
     simpson = np.ones(N_MASS_RATIOS)
     simpson[1:-1:2], simpson[2:-1:2] = 4.0, 2.0
-    span = -np.log(first)[:, None]
-    log_q = -span * np.linspace(1.0, 0.0, N_MASS_RATIOS)
+    span = np.log(high / first)[:, None]
+    log_q = np.log(high)[:, None] - span * np.linspace(1.0, 0.0, N_MASS_RATIOS)
     g = law.mass_ratio_exponent + 1.0
     steep = np.abs(g) > 1e-9
-    norm = np.where(
-        steep, (1.0 - law.mass_ratio_min**g) / np.where(steep, g, 1.0), -np.log(law.mass_ratio_min)
-    )
+    norm = np.where(steep, (high**g - low**g) / np.where(steep, g, 1.0), np.log(high / low))
     weight = np.exp(g[:, None] * log_q) / norm[:, None] * span / (N_MASS_RATIOS - 1) / 3.0 * simpson
     given = ~np.isnan(law.mass_ratio)
     ratio = np.where(given[:, None], law.mass_ratio[:, None], np.exp(log_q))
