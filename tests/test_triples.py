@@ -7,6 +7,8 @@ import pytest
 
 from porrima import triple_averages
 from porrima.averages import population_moments
+from porrima.clipping import count_pairs
+from porrima.colour import colour_bias
 from porrima.config import Multiplicity
 from porrima.distribution import size_distribution
 from porrima.errors import InputError
@@ -363,6 +365,10 @@ def test_impossible_hierarchies_are_refused(heavy):
 def test_what_knows_pairs_only_refuses_triples(heavy):
     with pytest.raises(InputError, match=r"multiplicity.triples: must be off where there is a selection"):
         of(heavy, selection=HardCut(separation=0.03))
+    with pytest.raises(InputError, match=r"triples: must be off for clips of many thresholds"):
+        count_pairs(of(heavy))
+    with pytest.raises(InputError, match=r"triples: must be off for the colour of companions"):
+        colour_bias(of(heavy), None, None)
     with pytest.raises(InputError, match="device: must be cpu for a run with triples"):
         draw_stacks(of(heavy), n_stars=4, binary_fraction=0.3, seed=1, first=0, last=1, device="cuda")
     with pytest.raises(InputError, match=r"multiplicity.triples: is no option of mds17"):
