@@ -73,7 +73,7 @@ def test_a_law_in_equal_classes_predicts_the_same(stars, weight):
     np.testing.assert_array_equal(split.primaries.mass, stars.mass)
     for fraction in (None, FRACTIONS):
         one, other = (population_moments(p, integrate(p), fraction) for p in (whole, split))
-        for field in fields(one):
+        for field in (f for f in fields(one) if f.name != "triples"):  # there are none
             values = np.asarray(getattr(one, field.name))
             near = 1e-12 * (1.0 if field.name == "relative_error" else np.max(np.abs(values)))
             np.testing.assert_allclose(getattr(other, field.name), values, rtol=1e-12, atol=near)

@@ -15,21 +15,46 @@ import numpy as np
 from porrima.errors import InputError
 from porrima.integrals import EVEN, PRODUCTS, coefficient_polynomial
 from porrima.moments import INDICES, N_MOMENTS, ORDER, angular_mean
+from porrima.triple_averages import triple_averages
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from porrima.integrals import PairIntegrals
     from porrima.systems import Population
+    from porrima.triple_averages import TripleSums
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["PopulationMoments", "population_moments"]
+__all__ = ["PopulationMoments", "TripleMoments", "population_moments"]
 
 _LEAST_KEPT = 1e-6  # share of the stars that must be left once resolved pairs are gone
 _POWERS = (ORDER + 1) ** 2
 _ORDERS = np.sum(INDICES, axis=1)
+_XX, _YY = INDICES.index((2, 0)), INDICES.index((0, 2))
 _SIZES = [INDICES.index((n, 0)) for n in EVEN]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TripleMoments:
+    """What triples add to the moments of one star of a stack, for k binary fractions.
+
+    Parameters
+    ----------
+    mean : (k, n_moment) float array
+        Their part of the mean moments, in arcsec^(a+b).
+    product : (k, n_moment, n_moment) float array
+        Their part of the mean products of two moments, with the weights of the stack squared.
+    kernel : (n, n_moment) float array
+        Moments of some triples, for what is not linear in them, in arcsec^(a+b).
+    share : (k, n) float array
+        Of the stars of the stack that each stands for, in [0, 1].
+    """
+
+    mean: FloatArray
+    product: FloatArray
+    kernel: FloatArray
+    share: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,10 +89,13 @@ class PopulationMoments:
         N times the covariance of the moments of stacks of N stars.
     powers : (k, 9, 9) float array
         :math:`\langle (4y)^j (r/r_{cut})^{2k} \rangle` over the stars, j and k from 0 to 8, with the weights of the
-        stack; j = 0 counts pairs.  Dimensionless.
+        stack; j = 0 counts pairs.  Dimensionless.  Of pairs alone, where there are triples.
     relative_error : (k,) float array
         Of the quadrature: the largest estimate among all powers with j and k above 0 and the mean
-        moments, with a selection among x and x² alone; dimensionless.
+        moments, with a selection among x and x² alone; with triples at least the standard error of x or x² by them;
+        dimensionless.
+    triples : TripleMoments or None
+        The part of triples in the moments; None where there are none.
 
     Notes
     -----
@@ -89,6 +117,7 @@ class PopulationMoments:
     covariance: FloatArray
     powers: FloatArray
     relative_error: FloatArray
+    triples: TripleMoments | None = None
 
     @property
     def missed_fraction(self) -> FloatArray:
@@ -138,13 +167,17 @@ def population_moments(
     """
     fraction, number, w = population.law.multiplicity_fraction, population.abundance, population.weight
     scale = population.scale(binary_fraction)
-    equal = bool(np.all(w == 1.0))
-    rows = [_star_sums(fraction, integrals, number * w, 0)]
-    rows.append(rows[0] if equal else _star_sums(fraction, integrals, number * w**2, 0))
-    rows.append(_star_sums(fraction, integrals, number * w, 1))
-    rows.append(_star_counts(fraction, integrals, number))
+    equal, of_pairs = bool(np.all(w == 1.0)), np.where(population.law.is_triple, 0.0, number)
+    rows = [_star_sums(fraction, integrals, of_pairs * w, 0)]
+    rows.append(rows[0] if equal else _star_sums(fraction, integrals, of_pairs * w**2, 0))
+    rows.append(_star_sums(fraction, integrals, of_pairs * w, 1))
+    rows.append(_star_counts(fraction, integrals, of_pairs))
     sums = _weighted_sums(np.unique(fraction), np.concatenate(rows, axis=1), scale)
     first, second, coarse, counts = np.split(sums, np.cumsum([r.shape[1] for r in rows[:-1]]), axis=1)
+    averages = triple_averages(population)
+    triples = None if averages is None else averages.sums(scale)
+    if triples is not None:
+        _count_triples(triples, first, second, counts)
     alone = number if integrals.single_kept is None else number * integrals.single_kept
     pairs, lost = counts[:, 0], counts[:, 1]
     kept = alone.sum() - lost
@@ -157,23 +190,64 @@ def population_moments(
     powers = _square(first, kept * mean_w)
     squares = _square(second, kept * mean_w**2)
     mean, weighted = _isotropic_means(powers, population.cut), _isotropic_means(squares, population.cut)
+    products = _isotropic_products(squares, population.cut)
+    part = None if triples is None else _triple_moments(triples, kept * mean_w, kept * mean_w**2)
+    if part is not None and triples is not None:
+        mean, products = mean + part.mean, products + part.product
+        weighted = weighted + triples.mean[1] / (kept * mean_w**2)[:, None]
     spread = np.ones((kept.size, 1)) if equal else (mean_w2 / mean_w**2)[:, None]
-    covariance = _isotropic_products(squares, population.cut)
-    covariance -= mean[:, :, None] * weighted[:, None, :] + weighted[:, :, None] * mean[:, None, :]
+    covariance = products - mean[:, :, None] * weighted[:, None, :] - weighted[:, :, None] * mean[:, None, :]
     covariance += spread[:, :, None] * mean[:, :, None] * mean[:, None, :]
+    mean_x = powers[:, 1, 1] * population.cut**2 / 4 + (0.0 if part is None else _mean_x(part))
+    mean_x2 = powers[:, 2, 2] * population.cut**4 / 16 + (0.0 if part is None else _mean_x2(part))
+    error = _relative_error(powers, _square(coarse, kept * mean_w), integrals.joint is None)
+    if triples is not None:
+        total = np.stack([kept * mean_w * mean_x, kept * mean_w**2 * mean_x2])
+        own = np.divide(triples.error, total, out=np.zeros_like(total), where=total > 0)
+        error = np.maximum(error, own.max(axis=0))
     return PopulationMoments(
         cut=population.cut,
         binary_fraction=pairs / fraction.size,
         **_shares(counts, kept, fraction.size, alone.sum()),
-        mean_x=powers[:, 1, 1] * population.cut**2 / 4,
-        mean_x2=powers[:, 2, 2] * population.cut**4 / 16,
+        mean_x=mean_x,
+        mean_x2=mean_x2,
         effective_share=1 / spread[:, 0],
         mean=mean,
         shift=spread * mean - weighted,
         covariance=covariance,
         powers=powers,
-        relative_error=_relative_error(powers, _square(coarse, kept * mean_w), integrals.joint is None),
+        relative_error=error,
+        triples=part,
     )
+
+
+def _count_triples(triples: TripleSums, first: FloatArray, second: FloatArray, counts: FloatArray) -> None:
+    """Add triples, and the weight lost to them, to the sums over pairs of `_star_sums` and `_star_counts`."""
+    lost = triples.number - triples.kept
+    first[:, -1] += triples.lost[0]
+    second[:, -1] += triples.lost[1]
+    counts += np.stack([triples.number, lost, lost, lost, triples.number], axis=1)
+
+
+def _triple_moments(triples: TripleSums, total: FloatArray, total2: FloatArray) -> TripleMoments:
+    """The part of triples in the mean star, from sums and what these are divided by."""
+    return TripleMoments(
+        mean=triples.mean[0] / total[:, None],
+        product=triples.product / total2[:, None, None],
+        kernel=triples.kernel,
+        share=triples.share / total[:, None],
+    )
+
+
+def _mean_x(part: TripleMoments) -> FloatArray:
+    """Mean of x that triples make, (k,)."""
+    return np.asarray(part.mean[:, _XX] + part.mean[:, _YY])
+
+
+def _mean_x2(part: TripleMoments) -> FloatArray:
+    """Mean of x² that triples make, (k,)."""
+    p = part.product
+    return np.asarray(p[:, _XX, _XX] + 2 * p[:, _XX, _YY] + p[:, _YY, _YY])
 
 
 def _star_sums(fraction: FloatArray, integrals: PairIntegrals, weight: FloatArray, rule: int) -> FloatArray:

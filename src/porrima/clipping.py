@@ -187,12 +187,14 @@ def count_pairs(population: Population, binary_fraction: float | None = None) ->
     Raises
     ------
     InputError
-        If stars have unequal weights, or there is a selection already.
+        If stars have unequal weights, there are triples, or there is a selection already.
     """
     if not np.all(population.weight == 1.0):
         raise InputError("must be equal for clips of many thresholds", key="stack_weight", value="flux")
     if population.selection is not None:
         raise InputError("must not be there for clips of many thresholds", key="selection")
+    if np.any(population.law.is_triple):
+        raise InputError("must be off for clips of many thresholds", key="multiplicity.triples", value=True)
     law, tracks, number = population.law, population.tracks, population.abundance
     scale = population.scale(None if binary_fraction is None else np.array([binary_fraction]))[0]
     pair = np.minimum(1.0, scale * law.multiplicity_fraction)

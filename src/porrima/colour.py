@@ -315,6 +315,11 @@ def colour_bias(
     bias : ColourBias
         For k binary fractions, dimensionless.
 
+    Raises
+    ------
+    InputError
+        If there are triples.
+
     Notes
     -----
     With s the shape of a single star behind the PSF, from its own photons, a pair of primary A and companion B has,
@@ -325,6 +330,8 @@ def colour_bias(
     selection by what it keeps of pairs and of single stars.  First order in the difference of the
     two spectra; the term with both colour and separation, of order :math:`\eta` times 0.1, is left out.
     """
+    if np.any(population.law.is_triple):
+        raise InputError("must be off for the colour of companions", key="multiplicity.triples", value=True)
     law, w, number = population.law, population.weight, population.abundance
     first = starts_of_mass_ratios(law)
     run = np.repeat(np.arange(first.size), np.diff(first, append=law.star.size))

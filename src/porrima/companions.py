@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, get_args
 
 import numpy as np
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from porrima.orbits import Projection
 
+    BoolArray = NDArray[np.bool_]
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
@@ -53,6 +54,8 @@ class CompanionLaw:
         log10 of the largest semi-major axis in au; infinite where there is none.
     mass_ratio : (m,) float array
         The mass ratio itself where a catalogue gives it, in (0, 1]; NaN where it is drawn.
+    is_triple : (m,) bool array
+        Whether the class is one of which a triple takes two, see `hierarchy`; of pairs where not given.
     """
 
     star: IntArray
@@ -65,6 +68,11 @@ class CompanionLaw:
     log_a_sigma: FloatArray
     log_a_max: FloatArray
     mass_ratio: FloatArray
+    is_triple: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    def __post_init__(self) -> None:
+        if self.is_triple.size != self.star.size:
+            object.__setattr__(self, "is_triple", np.zeros(self.star.size, np.bool_))
 
     @property
     def first(self) -> IntArray:
@@ -95,7 +103,7 @@ class CompanionLaw:
     def with_given(self, mass_ratio: FloatArray) -> CompanionLaw:
         """The law with the pairs that a catalogue has made: their mass ratios fixed, its single stars single.
 
-        Classes keep their shares, whatever the mass ratio.
+        Classes keep their shares, whatever the mass ratio.  A pair is no triple.
 
         Parameters
         ----------
@@ -114,6 +122,7 @@ class CompanionLaw:
                 np.isnan(mass_ratio), self.multiplicity_fraction, (mass_ratio > 0).astype(float)
             ),
             mass_ratio=np.where(mass_ratio > 0, mass_ratio, np.nan),
+            is_triple=self.is_triple & np.isnan(mass_ratio),
         )
 
     def moved(self, figure: str, change: FloatArray) -> CompanionLaw:

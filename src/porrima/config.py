@@ -81,6 +81,7 @@ class Multiplicity(_Strict):
     mass_ratio_min: float | None = Field(default=None, gt=0, lt=1)
     eccentricity: Literal["circular", "uniform", "thermal", "mds17"] | None = None
     metallicity: Literal["none", "moe19"] | None = None
+    triples: bool | None = None
 
     def build(self) -> Any:
         """The model itself.

@@ -21,6 +21,7 @@ from porrima.photometry import magnitude_on_track
 from porrima.prediction import predict
 from porrima.screen import kept_share, screen_of
 from porrima.singles import ANGLES, added_shapes, pair_moments
+from porrima.triple_averages import triple_averages
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -190,12 +191,18 @@ def size_distribution(
     density = pair_density(population, integrals, binary_fraction)
     push = moments.mean[0] @ response.second[2] / float(response.shape0.r2) * (n_stars - 1) / n_stars**2
     added = _added_sizes(density, response, population.cut, n_stars, push)
-    share = np.broadcast_to(density.share / added.shape[0], added.shape)
+    share = np.broadcast_to(density.share / added.shape[0], added.shape).ravel()
+    added = added.ravel()
+    if moments.triples is not None:
+        shines = np.any(moments.triples.kernel != 0, axis=1)
+        kernel = moments.triples.kernel[shines]
+        alone = added_shapes(response, kernel / n_stars)[0][:, 2] + kernel @ push
+        added, share = np.append(added, alone), np.append(share, moments.triples.share[0, shines])
     mean = n_stars * np.sum(share * added)
     if mean != 0:
         added = added * (bias / mean)
-    none = (1.0 - density.share.sum()) ** n_stars
-    value, cumulative = _sum_of_stars(added.ravel(), share.ravel(), n_stars)
+    none = (1.0 - share.sum()) ** n_stars
+    value, cumulative = _sum_of_stars(added, share, n_stars)
     return SizeDistribution(
         n_stars=n_stars, value=value, cumulative=cumulative, none=none, prediction=prediction
     )
@@ -224,7 +231,12 @@ def pair_density(
     scale = population.scale(None if binary_fraction is None else np.array([binary_fraction]))[0]
     pair, number = np.minimum(1.0, scale * law.multiplicity_fraction), population.abundance
     alone = 1.0 if integrals.single_kept is None else integrals.single_kept
-    pair = number * pair / np.sum(number * (alone - pair * integrals.lost))
+    kept = np.sum(number * (alone - pair * integrals.lost * ~law.is_triple))
+    averages = triple_averages(population)
+    if averages is not None:
+        triples = averages.sums(np.array([scale]))
+        kept -= triples.number[0] - triples.kept[0]
+    pair = np.where(law.is_triple, 0.0, number * pair / kept)
     place = np.log10(population.cut * population.stars.distance) - law.log_a
     kinds, which = np.unique(
         np.stack([law.log_a_sigma, law.log_a_max - law.log_a], axis=1).round(12), axis=0, return_inverse=True

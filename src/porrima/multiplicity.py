@@ -13,6 +13,7 @@ import numpy as np
 
 from porrima.companions import CompanionLaw, MultiplicityModel, RowErrors, check_option, multiplicity_scale
 from porrima.eccentricity import Eccentricity, eccentric
+from porrima.hierarchy import triple_fraction, with_triples
 from porrima.moe import MoeDiStefano2017
 from porrima.photometry import check_masses
 from porrima.published import Offner2023, Raghavan2010, SusemiehlMeyer2022, Winters2019
@@ -44,11 +45,12 @@ class _Row(NamedTuple):
     mass_ratio_exponent: float
     a_mean: float  # au
     sigma_log_period: float  # dex in days
+    companion_frequency: float  # companions to a star
 
 
-_VERY_LOW = _Row(0.0, 0.1, 0.22, 4.2, 4.5, 0.5)
-_LOW = _Row(0.1, 0.5, 0.26, 0.4, 5.3, 1.3)
-_SOLAR = _Row(0.7, 1.3, 0.44, 0.3, 45.0, 2.3)
+_VERY_LOW = _Row(0.0, 0.1, 0.22, 4.2, 4.5, 0.5, 0.22)
+_LOW = _Row(0.1, 0.5, 0.26, 0.4, 5.3, 1.3, 0.33)
+_SOLAR = _Row(0.7, 1.3, 0.44, 0.3, 45.0, 2.3, 0.62)
 
 
 ROW_ERRORS = (
@@ -81,6 +83,8 @@ class DucheneKraus2013:
         Least mass ratio, in (0, 1).
     eccentricity : {"circular", "uniform", "thermal", "mds17"}
         Of the orbits; KCM16 take circles.
+    triples : bool
+        Whether multiple stars may be triples, as many as there are companions beyond the first; KCM16 have pairs only.
 
     Raises
     ------
@@ -94,7 +98,8 @@ class DucheneKraus2013:
     [mass_ratio_min, 1].  log10 of the period is normal with :math:`\sigma_{\log P}`, so by Kepler's third
     law log10 of the semi-major axis is normal about :math:`\log_{10}\bar a` with
     :math:`\frac{2}{3}\sigma_{\log P}`, independent of the mass ratio.  A truncation redraws the
-    semi-major axis alone.  Pairs only: higher orders are left out, which is optimistic.
+    semi-major axis alone.  Without `triples` higher orders are left out, which is
+    optimistic; with it see `hierarchy`.
 
     References
     ----------
@@ -107,6 +112,7 @@ class DucheneKraus2013:
     projection: Projection = "isotropic"
     mass_ratio_min: float = 0.1
     eccentricity: Eccentricity = "circular"
+    triples: bool = False
 
     def __post_init__(self) -> None:
         if self.gap_rule not in ("lower", "solar"):
@@ -196,7 +202,8 @@ class DucheneKraus2013:
             log_a_max=log_a + beyond,
             mass_ratio=np.full(mass.shape, np.nan),
         )
-        return eccentric(law, mass, self.eccentricity)
+        law = eccentric(law, mass, self.eccentricity)
+        return with_triples(law, triple_fraction(table[:, 2], table[:, 6])) if self.triples else law
 
 
 MULTIPLICITY: dict[str, MultiplicityModel] = {

@@ -16,11 +16,12 @@ from porrima.averages import PopulationMoments, population_moments
 from porrima.integrals import EVEN, PairIntegrals, integrate
 from porrima.moments import INDICES, ORDER
 from porrima.response import SERIES_LIMIT
-from porrima.singles import added_to_shape, node_weights
+from porrima.singles import added_shapes, added_to_shape, node_weights
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from porrima.averages import TripleMoments
     from porrima.response import Response
     from porrima.singles import AddedShape
 
@@ -185,7 +186,7 @@ def predict(moments: PopulationMoments, response: Response, n_stars: int | None 
     else:
         added = added_to_shape(response, moments.cut, n_stars)
         n_too_wide = added.n_too_wide
-        bias, covariance = _star_by_star(moments, by_moments, n_stars, added)
+        bias, covariance = _star_by_star(moments, by_moments, n_stars, added, response)
     biased = np.abs(limit) > _NO_BIAS
     crossover = np.divide(scatter, limit**2, out=np.full_like(scatter, np.inf), where=biased)
     orders = series_orders(moments, response)
@@ -250,7 +251,7 @@ def _traces(by_moments: _Derivatives, covariance: FloatArray) -> FloatArray:
 
 
 def _star_by_star(
-    moments: PopulationMoments, by_moments: _Derivatives, n_stars: int, added: AddedShape
+    moments: PopulationMoments, by_moments: _Derivatives, n_stars: int, added: AddedShape, response: Response
 ) -> tuple[FloatArray, FloatArray]:
     """Change of shape (4, k) and covariance (4, 4, k), exact in what a single star adds."""
     weight, m, c = node_weights(moments.powers), moments.mean, moments.covariance
@@ -259,17 +260,40 @@ def _star_by_star(
         return (weight @ values.reshape(values.shape[0], -1)).reshape(-1, *values.shape[1:])
 
     bending = _bending(by_moments, m)
-    alone = average(added.mean)
+    alone, mixed, square = average(added.mean), average(added.with_moments), average(added.product)
+    if moments.triples is not None:
+        extra = _triples_alone(moments.triples, by_moments, n_stars, response)
+        alone, mixed, square = (a + b for a, b in zip((alone, mixed, square), extra, strict=True))
     bias = n_stars * alone + 0.5 * (1 - 1 / n_stars) * np.einsum("kqi,ki->kq", bending, m)
     push = bending * (n_stars - 1) / n_stars**2  # on a star's moments, from the others
     pulled = push.transpose(0, 2, 1)
-    mixed = average(added.with_moments) @ pulled
-    square = average(added.product) + mixed + mixed.transpose(0, 2, 1)
+    mixed = mixed @ pulled
+    square = square + mixed + mixed.transpose(0, 2, 1)
     square += push @ (c + m[:, :, None] * m[:, None, :]) @ pulled
     mean = alone + np.einsum("kqi,ki->kq", push, m)
     covariance = n_stars * (square - mean[:, :, None] * mean[:, None, :])
     covariance += 0.5 * (n_stars - 1) / n_stars**3 * _traces(by_moments, c)
     return bias.T, covariance.transpose(1, 2, 0)
+
+
+def _triples_alone(
+    triples: TripleMoments, by_moments: _Derivatives, n_stars: int, response: Response
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What single triples add to the shape, (k, 4), times moments, (k, 4, n_moment), and its square, (k, 4, 4).
+
+    To second order from their mean moments and products; what is beyond, from some of them.
+    """
+    first, second = by_moments.first / n_stars, by_moments.second / n_stars**2
+    kernel, share, product = triples.kernel, triples.share, triples.product
+    exact = added_shapes(response, kernel / n_stars)[0]
+    linear = kernel @ first.T
+    curved = 0.5 * np.einsum("ni,qij,nj->nq", kernel, second, kernel, optimize=True)
+    alone = triples.mean @ first.T + 0.5 * np.einsum("qij,kij->kq", second, product)
+    alone += share @ (exact - linear - curved)
+    mixed = first @ product + np.einsum("kn,nq,ni->kqi", share, exact - linear, kernel, optimize=True)
+    beyond = exact[:, :, None] * exact[:, None, :] - linear[:, :, None] * linear[:, None, :]
+    square = first @ product @ first.T + np.einsum("kn,nqr->kqr", share, beyond)
+    return alone, mixed, square
 
 
 def series_orders(moments: PopulationMoments, response: Response) -> FloatArray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from porrima.companions import CompanionLaw, RowErrors, check_option, warn_of_masses
 from porrima.eccentricity import Eccentricity, eccentric, orbit_nodes
+from porrima.hierarchy import triple_fraction, with_triples
 from porrima.moe import MetallicityTrend, apply_metallicity
 
 if TYPE_CHECKING:
@@ -44,12 +45,14 @@ class _LogNormals:
 
     name: ClassVar[str]
     table: ClassVar[tuple[Row, ...]]
+    triple_fractions: ClassVar[tuple[float, ...] | None] = None  # of all stars, where the paper counts them
     is_projected: ClassVar[bool] = False  # whether the table has separations on the sky for semi-major axes
 
     gap_rule: Literal["nearest", "interpolated"] = "nearest"
     eccentricity: Eccentricity = "circular"
     metallicity: MetallicityTrend = "none"
     mass_ratio_min: float = 0.1
+    triples: bool = False
 
     def __post_init__(self) -> None:
         if self.gap_rule not in ("nearest", "interpolated"):
@@ -136,7 +139,23 @@ class _LogNormals:
             log_a_max=np.full(mass.shape, np.inf),
             mass_ratio=np.full(mass.shape, np.nan),
         )
-        return eccentric(apply_metallicity(law, mass, metallicity, self.metallicity), mass, self.eccentricity)
+        law = eccentric(apply_metallicity(law, mass, metallicity, self.metallicity), mass, self.eccentricity)
+        return with_triples(law, self._triples(mass)) if self.triples else law
+
+    def _triples(self, mass: FloatArray) -> FloatArray:
+        """Share of triples among the multiple stars of each primary's kind, (n,)."""
+        fraction, frequency = np.array([row[2:4] for row in self.table]).T
+        if self.triple_fractions is not None:
+            frequency = fraction + np.array(self.triple_fractions)
+        share = triple_fraction(fraction, frequency)
+        if self.gap_rule == "nearest":
+            return np.asarray(share[self.rows(mass)])
+        return np.asarray(0.01 * np.round(np.interp(np.log10(mass), self._centres, share) / 0.01))
+
+    @property
+    def _centres(self) -> FloatArray:
+        """log10 of the middle mass of each row, in M_sun."""
+        return np.log10([row.mass_lo * row.mass_hi for row in self.table]) / 2.0
 
     def _figures(self, mass: FloatArray) -> tuple[FloatArray, ...]:
         """Multiplicity fraction, exponent, log10 of the axis [au] and its scatter [dex] of each primary, (n,)."""
@@ -144,8 +163,7 @@ class _LogNormals:
         rows[:, 2] = np.log10(rows[:, 2])
         if self.gap_rule == "nearest":
             return tuple(rows[self.rows(mass)].T)
-        centre = np.log10([row.mass_lo * row.mass_hi for row in self.table]) / 2.0
-        between = [np.interp(np.log10(mass), centre, column) for column in rows.T]
+        between = [np.interp(np.log10(mass), self._centres, column) for column in rows.T]
         steps = (0.001, 0.01, 0.001, 0.1)  # so that stars share what is computed once for all of a kind
         return tuple(step * np.round(column / step) for step, column in zip(steps, between, strict=True))
 
@@ -172,6 +190,8 @@ class Offner2023(_LogNormals):
         Whether close pairs depend on metallicity.
     mass_ratio_min : float
         Least mass ratio, in (0, 1).
+    triples : bool
+        Whether multiple stars may be triples, see `hierarchy`.
 
     Notes
     -----
@@ -188,6 +208,7 @@ class Offner2023(_LogNormals):
     """
 
     name: ClassVar[str] = "offner23"
+    triple_fractions: ClassVar[tuple[float, ...] | None] = (0.022, 0.036, 0.063, 0.12, 0.25)
     table: ClassVar[tuple[Row, ...]] = (
         Row(0.075, 0.15, 0.19, 0.21, 1.7, 4.0, 0.7, RowErrors.of(0.03, 0.5, 0.15, 0.15)),
         Row(0.15, 0.30, 0.23, 0.27, 0.7, 10.0, 1.0, RowErrors.of(0.02, 0.3, 0.25, 0.15)),
@@ -211,6 +232,8 @@ class Raghavan2010(_LogNormals):
         Whether close pairs depend on metallicity.
     mass_ratio_min : float
         Least mass ratio, in (0, 1).
+    triples : bool
+        Whether multiple stars may be triples, see `hierarchy`.
 
     Notes
     -----
@@ -246,6 +269,8 @@ class Winters2019(_LogNormals):
         Whether close pairs depend on metallicity, which was not measured for M dwarfs.
     mass_ratio_min : float
         Least mass ratio, in (0, 1).
+    triples : bool
+        Whether multiple stars may be triples, see `hierarchy`.
 
     Notes
     -----
@@ -281,6 +306,8 @@ class SusemiehlMeyer2022(_LogNormals):
         Whether close pairs depend on metallicity.
     mass_ratio_min : float
         Least mass ratio, in (0, 1).
+    triples : bool
+        Whether multiple stars may be triples, see `hierarchy`.
 
     Notes
     -----

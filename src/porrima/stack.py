@@ -35,6 +35,7 @@ from porrima.rejection import kept_single, lost_singles, reject_block, single_lo
 from porrima.screen import screen_of
 from porrima.streams import COUNT_STAGE, FRACTION_STAGE, binomial, halves, philox, uniform_pair
 from porrima.systems import Systems
+from porrima.triples import ROOM, add_triples, draw_triples, list_triples, member_rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -116,9 +117,11 @@ def draw_stacks(
     sums = np.zeros((last - first, N_MOMENTS))
     unit = np.array([(population.cut / CUT) ** (a + b) for a, b in INDICES])
     screen, fill = screen_of(population), _filler(device)
-    chosen = () if device == "cuda" else (screen, single_loss(population, screen, scale))
-    if device == "cuda" and not screen.is_empty:
-        raise InputError("must be cpu for a run with a selection", key="device", value=device)
+    member = member_rows(population)
+    chosen = () if device == "cuda" else (member, screen, single_loss(population, screen, scale))
+    for found, what in ((not screen.is_empty, "a selection"), (member.size > 0, "triples")):
+        if device == "cuda" and found:
+            raise InputError(f"must be cpu for a run with {what}", key="device", value=device)
     fill(tables_of(population), *chosen, np.uint64(seed), first, n_stars, fractions, scale, unit, sums)
     if np.any(np.isnan(sums[:, 0])):
         raise ValueError(
@@ -146,7 +149,7 @@ def draw_systems(
     Returns
     -------
     systems : Systems
-        The n_stars systems, pairs first.
+        The n_stars systems, multiple stars first; of three sources where the population has triples.
 
     Raises
     ------
@@ -155,16 +158,19 @@ def draw_systems(
     """
     fractions = _fractions(population, n_stars, binary_fraction, seed, stack, stack + 1)
     scale = population.scale(fractions) if binary_fraction != "model" else np.ones(1)
-    listed, sums = np.full((n_stars, 4), -1.0), np.zeros(N_MOMENTS)
-    block, key = np.zeros(BLOCK_SIZE, np.float32), np.uint64(seed)
+    listed, sums = np.tile([-1.0, *[0.0] * 6], (n_stars, 1)), np.zeros(N_MOMENTS)
+    member, block, key = member_rows(population), np.zeros(BLOCK_SIZE, np.float32), np.uint64(seed)
     screen = screen_of(population)
     loss = single_loss(population, screen, scale)[0]
     _draw_stack(
-        tables_of(population), screen, loss, block, key, stack, n_stars, fractions[0], scale[0], sums, listed
-    )
-    flux_ratio, dx, dy, weight = listed.T
-    unit = population.cut / CUT
-    return Systems.from_pairs(flux_ratio, dx * unit, dy * unit, weight)
+        tables_of(population), member, screen, loss, block, np.zeros(ROOM), key, stack, n_stars, fractions[0],
+        scale[0], sums, listed,
+    )  # fmt: skip
+    unit, weight = population.cut / CUT, listed[:, 3]
+    flux_ratio, dx, dy = listed[:, [0, 4]], listed[:, [1, 5]] * unit, listed[:, [2, 6]] * unit
+    if member.size == 0:
+        return Systems.from_pairs(flux_ratio[:, 0], dx[:, 0], dy[:, 0], weight)
+    return Systems.from_companions(flux_ratio, dx, dy, weight)
 
 
 def _filler(device: Device) -> Callable[..., None]:
@@ -209,7 +215,9 @@ def _uniform_fractions(seed, first, fractions):  # type: ignore[no-untyped-def]
 
 
 @njit(forceinline=True, _nrt=False, cache=True)
-def _draw_stack(tables, screen, loss, block, seed, stack, n_stars, fraction, scale, sums, listed):  # type: ignore[no-untyped-def]
+def _draw_stack(  # type: ignore[no-untyped-def]
+    tables, member, screen, loss, block, room, seed, stack, n_stars, fraction, scale, sums, listed
+):
     """Sum of the weights of one stack, with those of its moments, in the unit of length, in `sums`.
 
     Its systems are listed where `listed` has rows.
@@ -231,7 +239,7 @@ def _draw_stack(tables, screen, loss, block, seed, stack, n_stars, fraction, sca
             continue
         if lane == LANES:
             if n_blocks > 0:
-                total += _add_block(tables.weight, block, listed)
+                total += _add_block(tables.weight, member, block, room, sums, listed)
                 if n_blocks % _BLOCKS_IN_FLOAT32 == 0:
                     flush(block, sums)
             if n_blocks * LANES > MOST_TRIES * (n_stars + 100):
@@ -239,6 +247,8 @@ def _draw_stack(tables, screen, loss, block, seed, stack, n_stars, fraction, sca
             draw_block(tables, block, scale, key_low, key_high, low, high, n_blocks * LANES)
             if screen.score.size > 0:
                 reject_block(screen, block, key_low, key_high, low, high, n_blocks * LANES)
+            if member.shape[0] > 0:
+                draw_triples(tables, member, block, room, key_low, key_high, low, high, n_blocks * LANES)
             n_blocks, lane = n_blocks + 1, 0
         if lane == 0 and wanted >= LANES:
             n_valid, n_kept = keep_block(block)
@@ -247,7 +257,7 @@ def _draw_stack(tables, screen, loss, block, seed, stack, n_stars, fraction, sca
             lane, n_valid, n_kept = keep_lanes(block, lane, wanted)
         wanted, resolved, kept = wanted - n_valid, resolved + n_valid - n_kept, kept + n_kept
     if n_blocks > 0:
-        total += _add_block(tables.weight, block, listed)
+        total += _add_block(tables.weight, member, block, room, sums, listed)
         flush(block, sums)
     if tables.weight.size == 0 and listed.shape[0] == 0:  # single stars cost nothing
         return float(n_stars)
@@ -255,19 +265,24 @@ def _draw_stack(tables, screen, loss, block, seed, stack, n_stars, fraction, sca
 
 
 @njit(forceinline=True, _nrt=False)
-def _add_block(weight, block, listed):  # type: ignore[no-untyped-def]
-    """Add the moments of the kept pairs of a block and list them below the last one; their weight, where weighed."""
+def _add_block(weight, member, block, room, sums, listed):  # type: ignore[no-untyped-def]
+    """Add the moments of the kept systems of a block and list them below the last one; their weight, where weighed."""
     total = weigh_block(weight, block) if weight.size > 0 else 0.0
     sum_block(block)
+    if member.shape[0] > 0:
+        add_triples(member, block, room, sums)
     if listed.shape[0] > 0:
         row = 0
         while row < listed.shape[0] and listed[row, 0] >= 0.0:
             row += 1
+        first = row
         for lane in range(LANES):
             if block[KEPT + lane] > np.float32(0):
                 listed[row, 0], listed[row, 3] = block[FLUX_RATIO + lane], block[KEPT + lane]
                 listed[row, 1], listed[row, 2] = block[X + lane], block[Y + lane]
                 row += 1
+        if member.shape[0] > 0:
+            list_triples(member, block, room, listed, first)
     return total
 
 
@@ -287,18 +302,20 @@ def _add_singles(tables, screen, key_low, key_high, low, high, n_stars, kept, sc
 
 
 @njit(cache=True, parallel=True)
-def _fill(tables, screen, loss, seed, first, n_stars, fractions, scale, unit, sums):  # type: ignore[no-untyped-def]
+def _fill(tables, member, screen, loss, seed, first, n_stars, fractions, scale, unit, sums):  # type: ignore[no-untyped-def]
     """Stacks of a range, a few at a time on each thread; `unit` turns lengths to arcsec."""
     n_batches = (fractions.size + _BATCH - 1) // _BATCH
     for batch in prange(n_batches):
         block = np.zeros(BLOCK_SIZE, np.float32)
-        listed = np.empty((0, 4))
+        listed, room = np.empty((0, 7)), np.zeros(ROOM)
         for s in range(batch * _BATCH, min((batch + 1) * _BATCH, fractions.size)):
             total = _draw_stack(
                 tables,
+                member,
                 screen,
                 loss[s],
                 block,
+                room,
                 seed,
                 first + s,
                 n_stars,

@@ -13,13 +13,16 @@ from numba import int32, njit, uint32, uint64
 
 __all__ = [
     "ALONE_STAGE", "COUNT_STAGE", "FRACTION_STAGE", "LOST_STAGE", "PAIR_STAGE", "PHASE_STAGE", "SCREEN_STAGE",
-    "SINGLE_STAGE", "binomial", "halves", "philox", "uniform_pair",
+    "SINGLE_STAGE", "TRIPLE_STAGE", "binomial", "halves", "philox", "uniform_pair",
 ]  # fmt: skip
 
 FRACTION_STAGE, COUNT_STAGE, PAIR_STAGE, SINGLE_STAGE, PHASE_STAGE, LOST_STAGE, ALONE_STAGE, SCREEN_STAGE = (
     range(8)
 )
 """Stages of a stack, each with a stream of its own; every layer of a selection has another from the last on."""
+
+TRIPLE_STAGE = 1 << 16
+"""First stage of the hierarchies of triples: one for their directions, and two more for each that is tried."""
 
 _LOW = uint64(0xFFFFFFFF)
 

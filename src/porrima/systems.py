@@ -64,6 +64,10 @@ class Population:
     weight: FloatArray
     selection: Selection | None = None
 
+    def __post_init__(self) -> None:
+        if self.selection is not None and np.any(self.law.is_triple):
+            raise InputError("must be off where there is a selection", key="multiplicity.triples", value=True)
+
     @classmethod
     def of(
         cls,
@@ -100,7 +104,8 @@ class Population:
         Raises
         ------
         InputError
-            If there are no stars, one lies outside the range of a model, or the cut is not positive.
+            If there are no stars, one lies outside the range of a model, the cut is not positive, or there are
+            triples and a selection, which knows pairs only.
         """
         if len(stars) == 0:
             raise InputError("no star is left after selection", source=stars.source or None)
@@ -213,6 +218,41 @@ class Systems:
         flux = np.stack([1 / (1 + f), f / (1 + f)], axis=1)
         from_centroid = np.stack([-f / (1 + f), 1 / (1 + f)], axis=1)
         return cls(flux=flux, x=from_centroid * dx[:, None], y=from_centroid * dy[:, None], weight=w)
+
+    @classmethod
+    def from_companions(
+        cls, flux_ratio: FloatArray, dx: FloatArray, dy: FloatArray, weight: FloatArray | None = None
+    ) -> Systems:
+        """Systems of a primary and k companions.
+
+        Parameters
+        ----------
+        flux_ratio : (n, k) float array
+            Flux of each companion over that of the primary, in [0, 1]; 0 where there is none.
+        dx, dy : (n, k) float array
+            Offsets from the primary along the detector axes, in arcsec.
+        weight : (n,) float array, optional
+            Weight in the stack, dimensionless; 1 where not given.
+
+        Returns
+        -------
+        systems : Systems
+            Primary first, then its companions.
+
+        Raises
+        ------
+        ValueError
+            If a flux ratio lies outside [0, 1], an offset is not finite, or the weights do not sum to more than 0.
+        """
+        w = np.ones(len(flux_ratio)) if weight is None else np.asarray(weight, dtype=float)
+        for of in range(flux_ratio.shape[1]):
+            cls.from_pairs(flux_ratio[:, of], dx[:, of], dy[:, of], w)
+        alone = np.zeros((len(w), 1))
+        flux = np.concatenate([alone + 1, flux_ratio], axis=1)
+        flux /= flux.sum(axis=1, keepdims=True)
+        x, y = (np.concatenate([alone, d], axis=1) for d in (dx, dy))
+        x, y = (d - np.sum(flux * d, axis=1, keepdims=True) for d in (x, y))
+        return cls(flux=flux, x=x, y=y, weight=w)
 
     def __len__(self) -> int:
         return int(self.weight.size)
