@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     Parts = dict[str, xr.Dataset]
 
-__all__ = ["keep", "kept", "source_key", "versions"]
+__all__ = ["fingerprint", "keep", "kept", "source_key", "versions"]
 
 _PACKAGES = ("numpy", "scipy", "numba", "galsim", "astropy", "xarray")
 _HERE = Path(__file__).parent
@@ -73,6 +73,30 @@ def _imported(tree: ast.Module) -> set[str]:
     names = {module.split(".")[1] for module, _ in froms if module.startswith("porrima.")}
     names |= {alias.name for module, aliases in froms if module == "porrima" for alias in aliases}
     return {name for name in names if (_HERE / f"{name}.py").is_file()}
+
+
+def fingerprint(parts: Parts) -> str:
+    """Name of the numbers in datasets.
+
+    Parameters
+    ----------
+    parts : dict
+        Datasets by name.
+
+    Returns
+    -------
+    key : str
+        Equal for equal numbers, labels and attributes only.
+    """
+    content = [
+        (
+            name,
+            part.attrs,
+            [(str(key), one.dims, one.to_numpy().tolist()) for key, one in part.variables.items()],
+        )
+        for name, part in parts.items()
+    ]
+    return content_key(content)
 
 
 def kept(path: Path, key: str) -> Parts | None:

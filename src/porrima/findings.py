@@ -43,6 +43,7 @@ def of_errors_and_biases(numbers: ErrorsAndBiases, requirement: Requirement) -> 
     bias_r2 = limit["bias"].sel(quantity="r2", drop=True)
     bias_e = abs(limit["bias"].sel(quantity=ends)).max("quantity")
     n_failed, n_stacks = numbers.summary["n_failed"].sum("bin"), numbers.summary["n_stacks"].sum()
+    widest = [int(np.argmax(np.nan_to_num(np.abs(bias.to_numpy())))) for bias in (bias_r2, bias_e)]
     findings = {
         "fraction": numbers.fraction,
         "mean_x": numbers.mean_x,
@@ -53,7 +54,9 @@ def of_errors_and_biases(numbers: ErrorsAndBiases, requirement: Requirement) -> 
         "bias_e": bias_e,
         "sd_r2": here["sd"].sel(quantity="r2", drop=True),
         "sd_e": here["sd"].sel(quantity=ends).max("quantity"),
-        "widest_bias_r2": abs(bias_r2).max(),
+        "largest_sd_r2": here["sd"].sel(quantity="r2", drop=True).max(),
+        "largest_sd_e": here["sd"].sel(quantity=ends).max(),
+        "widest_bias_r2": bias_r2.isel(psf=widest[0], drop=True),
         "widest_bias_e": bias_e.max(),
         **_agreement(numbers.summary),
     }
@@ -67,6 +70,8 @@ def of_errors_and_biases(numbers: ErrorsAndBiases, requirement: Requirement) -> 
         "config": canonical(numbers.config),
         "requirement": requirement.name,
         "source": requirement.source,
+        "widest_r2": numbers.config.psf[widest[0]],
+        "widest_e": numbers.config.psf[widest[1]],
     }
     return {
         "summary": numbers.summary,
@@ -149,4 +154,5 @@ def _agreement(summary: xr.Dataset) -> dict[str, float]:
         for name in _COMPARED
     }
     found = {f"pull_{name}": float(pull.max()) for name, pull in pulls.items()}
+    found["pull"] = max((pull for pull in found.values() if np.isfinite(pull)), default=np.nan)
     return found | {"n_compared": float(sum(int(pull.notnull().sum()) for pull in pulls.values()))}

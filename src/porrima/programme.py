@@ -116,7 +116,7 @@ def programme(
 def carried_out(
     experiments: list[Experiment],
     folder: Path,
-    progress: Callable[[Experiment, bool], AbstractContextManager[Advance]],
+    progress: Callable[[str, int, str, bool], AbstractContextManager[Advance]],
 ) -> Iterator[tuple[str, Parts]]:
     """Numbers of the experiments: those kept from an earlier call, and the others made now.
 
@@ -127,8 +127,8 @@ def carried_out(
     folder : Path
         Where their numbers are kept, each under the key of settings and source.
     progress : callable
-        Given an experiment and whether its numbers are there already; a context that gives what is called with how
-        much is done.
+        Given name, size and unit of an experiment and whether its numbers are there already; a context that gives
+        what is called with how much is done.
 
     Yields
     ------
@@ -144,7 +144,7 @@ def carried_out(
         path = folder / experiment.name
         key = content_key(experiment.settings, source_key("programme"))
         parts = kept(path, key)
-        with progress(experiment, parts is not None) as advance:
+        with progress(experiment.name, experiment.size, experiment.unit, parts is not None) as advance:
             if parts is None:
                 keep(path, key, experiment.make(advance))
                 parts = kept(path, key) or {}
