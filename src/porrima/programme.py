@@ -23,6 +23,7 @@ from porrima.experiments import (
 from porrima.findings import of_errors_and_biases, of_magnitude, of_n_stars, of_population
 from porrima.instruments import KCM16
 from porrima.multiplicity import MULTIPLICITY
+from porrima.psf import psf_from_name
 from porrima.star_experiments import N_DIRECTIONS, population
 
 if TYPE_CHECKING:
@@ -100,7 +101,14 @@ def programme(
     -------
     experiments : list of Experiment
         In the order of the report.
+
+    Raises
+    ------
+    InputError
+        If a PSF or a number is wrong.
     """
+    for name in psf or ():
+        psf_from_name(name)  # refuses what is none before anything is made
     config = paper_config(full=full, seed=seed, psf=psf, n_stars=n_stars)
     runs = {"errors_and_biases": config}
     runs["errors_and_biases_kcm16"] = config.model_copy(

@@ -81,8 +81,13 @@ def write_paper(results: Mapping[str, Parts], folder: Path, claims: Sequence[Map
     -------
     page : Path
         ``index.html`` in the folder.
+
+    Raises
+    ------
+    ValueError
+        If a claim is not whole.
     """
-    sections = []
+    stated, sections = claims_from(claims), []
     for name, parts in results.items():
         section = _section(name, parts, _drawn(name, parts, folder))
         for table in section.tables:
@@ -93,7 +98,7 @@ def write_paper(results: Mapping[str, Parts], folder: Path, claims: Sequence[Map
         title="Errors and biases of the PSF from unresolved binary stars",
         subtitle="The figures of Kuntzer, Courbin & Meylan (2016), simulated and predicted",
         sections=tuple(sections),
-        claims=claims_from(claims),
+        claims=stated,
         **_said(results["errors_and_biases"]["findings"]),
         **_provenance(runs),
     )
