@@ -26,7 +26,11 @@
     need(table.caption && table.caption.textContent.trim(), "a caption of " + table.id);
     need([...table.querySelectorAll("th")].every((head) => head.scope), "scopes in " + table.id);
   }
-  for (const control of all("a, button")) need((control.textContent + control.ariaLabel).trim(), "a name of a control");
+  for (const control of all("a, button")) {
+    const text = control.textContent.trim();
+    need(text || control.ariaLabel, "a name of a control");
+    need(!control.ariaLabel || control.ariaLabel.includes(text), "the visible name in " + control.ariaLabel);
+  }
   for (const box of all(".scroll, .rows, .equation")) {
     const wide = box.scrollWidth > box.clientWidth || box.scrollHeight > box.clientHeight;
     need(!wide || !seen(box) || (box.tabIndex === 0 && box.ariaLabel), "a way for the keyboard into " + box.ariaLabel);
@@ -55,6 +59,10 @@
     if (ratio < 4.5) weak.add(element.tagName + "." + element.className + " " + ratio.toFixed(2));
   }
   need(weak.size === 0, "contrast in " + [...weak].slice(0, 5).join(", "));
+  for (const drawing of all("main svg")) {  // its letters
+    const ratio = contrast(light(channels(getComputedStyle(drawing).color)), ground(drawing));
+    need(ratio >= 4.5, "contrast of letters in " + drawing.getAttribute("aria-labelledby"));
+  }
   for (const line of all("svg path, svg use")) {
     const style = getComputedStyle(line);
     if (!seen(line) || style.stroke === "none" || !/--(?!grid|paper)/.test(line.getAttribute("style") || "")) continue;

@@ -210,7 +210,9 @@ def _section(name: str, parts: Parts, svg: str) -> Section:
     """All that the page says of an experiment."""
     findings, kind = parts["findings"], _kind(name, parts)
     config = _config(findings) if "config" in findings.attrs else None
-    about = {key: value for part in parts.values() for key, value in part.attrs.items()}
+    about = {key: value for part in parts.values() for key, value in part.attrs.items()} | {
+        "experiment": name
+    }
     label, caption, text = (
         words(f"{kind}_{piece}", _numbers(findings), config, about) for piece in ("label", "caption", "text")
     )
@@ -221,7 +223,7 @@ def _section(name: str, parts: Parts, svg: str) -> Section:
         caption=caption,
     )
     make = _plain if kind in ("population", "magnitude") else _statistics
-    table = make(name, label, _records(kind, parts))
+    table = make(name, _TITLES[name], _records(kind, parts))
     return Section(
         name=name.replace("_", "-"), title=_TITLES[name], text=(text,), figures=(shown,), tables=(table,)
     )

@@ -13,7 +13,7 @@ for (const button of document.querySelectorAll("button[data-copies]")) {
       document.execCommand("copy");
       selection.removeAllRanges();
     }
-    said.textContent = "Copied: " + button.getAttribute("aria-label");
+    said.textContent = button.getAttribute("aria-label").replace("Copy", "Copied");
   });
 }
 const scrollers = document.querySelectorAll(".scroll, .rows, .equation");
