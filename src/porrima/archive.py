@@ -88,14 +88,10 @@ def fingerprint(parts: Parts) -> str:
     key : str
         Equal for equal numbers, labels and attributes only.
     """
-    content = [
-        (
-            name,
-            part.attrs,
-            [(str(key), one.dims, one.to_numpy().tolist()) for key, one in part.variables.items()],
-        )
-        for name, part in parts.items()
-    ]
+    content = []
+    for name, part in sorted(parts.items()):  # a store has its arrays in any order
+        arrays = sorted((str(key), one.dims, one.to_numpy().tolist()) for key, one in part.variables.items())
+        content.append((name, sorted(part.attrs.items()), arrays))
     return content_key(content)
 
 
