@@ -56,6 +56,7 @@ _TITLES = {
     "errors_and_biases_optical": "Optical PSFs",
     "magnitude": "Against magnitude",
 }
+_ONE = "Bias and scatter at one binary fraction"
 _HEADS = (
     "PSF", "quantity", "binary fraction", "stacks", "bias", "predicted", "σ", "predicted", "sd", "predicted",
 )  # fmt: skip
@@ -222,11 +223,10 @@ def _section(name: str, parts: Parts, svg: str) -> Section:
         drawing=drawing(svg, name, label.striptags(), caption.striptags()),
         caption=caption,
     )
+    title = _ONE if kind == "one" else _TITLES[name]
     make = _plain if kind in ("population", "magnitude") else _statistics
-    table = make(name, _TITLES[name], _records(kind, parts))
-    return Section(
-        name=name.replace("_", "-"), title=_TITLES[name], text=(text,), figures=(shown,), tables=(table,)
-    )
+    table = make(name, title, _records(kind, parts))
+    return Section(name=name.replace("_", "-"), title=title, text=(text,), figures=(shown,), tables=(table,))
 
 
 def _kind(name: str, parts: Parts) -> str:
