@@ -360,6 +360,10 @@ WRONG = [  # arguments, what the one line says
     ([*BUDGET, "--plot", "x.xyz", "-o", "y.ecsv"], "plot: must end in .png, .pdf, .svg, got x.xyz"),
     ([*BUDGET, "--plot", "nowhere/x.png", "-o", "y.ecsv"], "output: cannot be written (No such folder)"),
     (["paper", "-o", "out", "--seed", "-1"], "seed: must be greater than or equal to 0, got -1"),
+    (["paper", "-o", "out", "--psf", "psf9"], "psf: must be one of psf0, psf1, psf2"),
+    (["paper", "-o", "out", "--n-stars", "0"], "n_stars: must be greater than or equal to 1, got 0"),
+    (["report", "absent.zarr", "-o", "x.html"], "absent.zarr: is not a run of porrima simulate"),
+    (["report", "{stars}", "-o", "x.html", "--bins", "0"], "--bins: must be at least 1, got 0"),
     (["bench", "--seed", "-1"], "seed: must be greater than or equal to 0, got -1"),
     ([*GALAXY, "--mag", "0", "inf"], "mag must be [lo, hi) with lo < hi, within -50 to 50"),
     (["simulate", "{config}", "-o", "x" * 300], "output: cannot be written (File name too long)"),
@@ -436,7 +440,8 @@ def test_help_needs_nothing_heavy():
 
 
 @pytest.mark.parametrize(
-    "command", ["stars", "measure", "response", "toy", "predict", "simulate", "summary", "paper", "bench"]
+    "command",
+    ["stars", "measure", "response", "toy", "predict", "simulate", "summary", "report", "paper", "bench"],
 )
 def test_every_command_has_help_and_json(porrima, command):
     code, out, _ = porrima(command, "--help")

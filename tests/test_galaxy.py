@@ -5,10 +5,10 @@ import pytest
 
 from porrima import star_figures as figures
 from porrima.dust import WAVELENGTHS, Place, extinction_ratio
-from porrima.experiments import galaxy_against_catalog, population
 from porrima.galaxy import Robin2003
 from porrima.photometry import MainSequence, magnitudes
 from porrima.populations import COMPONENTS, LOG_MASS, main_sequence_end
+from porrima.star_experiments import galaxy_against_catalog, population
 from porrima.stars import COMPONENTS as NAMES
 from statistics_helpers import assert_within_sigma
 

@@ -1,21 +1,37 @@
 """Experiment, figure and report of the paper's six panels, on a small run."""
 
+import base64
+import json
 import re
-from html.parser import HTMLParser
-from xml.etree import ElementTree
+from pathlib import Path
 
+import html5lib
 import numpy as np
 import pytest
+import yaml
 from astropy.table import Table
 
-from porrima.config import RunConfig, StarsConfig
-from porrima.experiments import effect_of_n_stars, errors_and_biases, n_stars_configs, paper_config
+from browser import Browser, executable
+from porrima.config import RunConfig, StarsConfig, parse
+from porrima.experiments import (
+    against_magnitude,
+    effect_of_n_stars,
+    errors_and_biases,
+    n_stars_configs,
+    paper_config,
+)
 from porrima.figures import effect_of_n_stars as effect_of_n_stars_drawn
 from porrima.figures import errors_and_biases as drawn
+from porrima.findings import of_errors_and_biases, of_magnitude, of_population
+from porrima.findings import of_n_stars as effect_parts
 from porrima.instruments import EUCLID_VIS, KCM16
-from porrima.report import write_report
+from porrima.multiplicity import MULTIPLICITY
+from porrima.programme import READINGS
+from porrima.report import write_paper, write_run
+from porrima.star_experiments import population
 from porrima.star_figures import selection
 from porrima.stars import Stars
+from porrima.summary import rows
 from statistics_helpers import assert_within_sigma
 
 
@@ -116,52 +132,198 @@ def test_each_panel_shows_its_symbols_and_lines(numbers):
     assert {axis.get_xlabel() for axis in axes[-2:]} == {"binary fraction of the population"}
 
 
-class _Page(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.open, self.links = [], []
-
-    def handle_starttag(self, tag, attributes):
-        self.links += [v for k, v in attributes if k in ("src", "href") and not v.startswith("#")]
-        if tag not in ("meta", "br", "link", "img", "path", "use", "rect"):
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attributes):
-        self.links += [v for k, v in attributes if k in ("src", "href") and not v.startswith("#")]
-
-    def handle_endtag(self, tag):
-        if self.open and self.open[-1] == tag:
-            self.open.pop()
+@pytest.fixture(scope="module")
+def results(numbers, of_n_stars):
+    sky = population(magnitude=(18.0, 19.0))
+    magnitude = against_magnitude(
+        np.array([18.0, 19.0, 20.0, 21.0]), {name: MULTIPLICITY[name] for name in READINGS}, n_drawn=100
+    )
+    return {
+        "population": of_population(sky),
+        "errors_and_biases": of_errors_and_biases(numbers, KCM16),
+        "effect_of_n_stars": effect_parts(of_n_stars, KCM16),
+        "magnitude": of_magnitude(magnitude),
+    }
 
 
-def test_the_page_needs_no_network_and_quotes_the_saved_numbers(numbers, of_n_stars, tmp_path):
-    path = write_report(numbers, of_n_stars, tmp_path)
-    text = path.read_text(encoding="utf-8")
-    page = _Page()
-    page.feed(text)
-    assert page.open == []
-    assert not [link for link in page.links if link.startswith(("http", "//"))]
-    first = numbers.summary["bias"].sel(psf="psf0", quantity="r2")[0].item()
-    assert f"{first * 1e3:.4f} ± " in text
-    assert '"seed": 1' in text.replace("&quot;", '"')
-    stems = ("effect_of_n_stars", "errors_and_biases")
-    files = [f"{stem}.{suffix}" for stem in stems for suffix in ("ecsv", "pdf", "png", "svg")]
-    assert sorted(p.name for p in tmp_path.iterdir()) == [*files, "index.html"]
+CLAIMS = [
+    {"number": 2, "statement": "Bias and error of the size are the same.", "paper": "σ ≃ bias", "porrima": 1.25,
+     "error": 0.0625, "verdict": verdict, "why": "The scatter of few stars < is added & counts."}
+    for verdict in ("holds", "holds under the paper's assumption only", "does not hold")
+]  # fmt: skip
 
 
-def test_the_same_numbers_give_the_same_files(numbers, of_n_stars, tmp_path):
+@pytest.fixture(scope="module")
+def folder(results, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    write_paper(results, folder, CLAIMS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(folder):
+    """The page as a parser reads it that takes nothing that is not HTML 5."""
+    return parsed(folder / "index.html")
+
+
+def parsed(path):
+    parser = html5lib.HTMLParser(strict=True, namespaceHTMLElements=False)
+    return parser.parse(path.read_text(encoding="utf-8"))
+
+
+def words_of(element, skip=()):
+    if not isinstance(element.tag, str) or element.tag.rpartition("}")[2] in skip:
+        return element.tail or ""
+    return (element.text or "") + "".join(words_of(one, skip) for one in element) + (element.tail or "")
+
+
+def numbers_in(value):
+    """All numbers in datasets and configurations."""
+    if isinstance(value, dict):
+        return set().union(*map(numbers_in, value.values()), set())
+    if isinstance(value, list | tuple):
+        return set().union(*map(numbers_in, value), set())
+    if isinstance(value, str):
+        return numbers_in(json.loads(value)) if value.startswith("{") else set()
+    if value is None or isinstance(value, bool):
+        return set()
+    return {float(value)}
+
+
+def saved(results):
+    parts = [part for one in results.values() for part in one.values()]
+    values = [variable.to_numpy().ravel() for part in parts for variable in part.variables.values()]
+    known = {float(number) for some in values if some.dtype.kind in "fiub" for number in some}
+    return known.union(*(numbers_in(dict(part.attrs)) for part in parts))
+
+
+def labels(results):
+    """Words that come with the numbers."""
+    parts = [part for one in results.values() for part in one.values()]
+    values = [variable.to_numpy().ravel() for part in parts for variable in part.variables.values()]
+    words = {str(word) for some in values if some.dtype.kind in "UOT" for word in some}
+    words |= {str(word) for part in parts for word in part.attrs.values() if isinstance(word, str)}
+    return words | {"Kuntzer, Courbin & Meylan (2016)", "R²", "(PSF)", "arcsec²", "deg²", "10−3", *results}
+
+
+def test_every_number_in_the_page_is_one_that_was_saved(results, page):
+    known = saved(results) | numbers_in(CLAIMS)
+    quotes = list(page.iter("data"))
+    assert len(quotes) > 1000
+    for quote in quotes:
+        value = float(quote.get("value"))
+        assert value in known, value
+        text = words_of(quote).removesuffix(quote.tail or "").replace(" ", "").replace("−", "-")
+        mantissa, _, exponent = text.removesuffix(" %").replace(" ", "").replace("%", "").partition("×10")
+        shown = float(mantissa) * 10.0 ** int(exponent or 0) * (0.01 if text.endswith("%") else 1.0)
+        shown *= float(quote.get("data-scale", 1.0))
+        places = len(mantissa.partition(".")[2])
+        unit = 10.0 ** (int(exponent or 0) - places) * (0.01 if text.endswith("%") else 1.0)
+        unit *= float(quote.get("data-scale", 1.0))
+        assert abs(abs(shown) - abs(value)) <= 0.5001 * unit, (text, value)
+
+
+def test_there_is_no_number_that_the_page_does_not_mark_as_saved(results, page):
+    sections = [one for one in page.iter("section") if one.get("aria-labelledby") not in
+                ("methods", "configuration", "versions", "references", "claims")]  # fmt: skip
+    assert len(sections) == 2 + len(results)
+    for section in sections:
+        text = words_of(section, skip=("data", "svg", "summary"))
+        for words in sorted(labels(results), key=len, reverse=True):
+            text = text.replace(words, "")
+        text = re.sub(r"\be[12]\b|latitude at l = \d+°|longitude at b = 45°|[a-z_]+, e = [\d.]+", "", text)
+        assert not re.search(r"\d", text), re.search(r".{0,60}\d.{0,60}", text, re.S)[0]
+
+
+def test_the_page_loads_nothing(page, folder):
+    for element in page.iter():
+        for name, value in element.attrib.items():
+            if str(name).split("}")[-1] in ("src", "href", "data", "poster", "srcset", "action"):
+                link = element.tag == "a" and value.startswith("https://")
+                assert value.startswith(("#", "data:")) or link, (element.tag, value[:80])
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    assert not re.findall(r"@import|url\((?!#)[^)]{0,40}", text)
+    policy = next(one for one in page.iter("meta") if one.get("http-equiv") == "Content-Security-Policy")
+    assert policy.get("content").startswith("default-src 'none'")
+
+
+def test_the_tables_can_be_taken_away_with_all_their_digits(results, page):
+    links = {one.get("download"): one.get("href") for one in page.iter("a") if one.get("download")}
+    for suffix in ("csv", "ecsv"):
+        text = base64.b64decode(links[f"errors_and_biases.{suffix}"].partition("base64,")[2]).decode()
+        table = Table.read(text, format=f"ascii.{suffix}")
+        assert table.colnames == list(rows(results["errors_and_biases"]["summary"])[0])
+        expected = results["errors_and_biases"]["summary"]["bias"].sel(psf="psf0", quantity="r2").to_numpy()
+        np.testing.assert_array_equal(table["bias"][:20], expected)
+    config = yaml.safe_load(base64.b64decode(links["errors_and_biases.yaml"].partition("base64,")[2]))
+    assert parse(RunConfig, config) == parse(
+        RunConfig, json.loads(results["errors_and_biases"]["findings"].attrs["config"])
+    )
+    claims = base64.b64decode(links["claims.csv"].partition("base64,")[2]).decode()
+    assert len(Table.read(claims, format="ascii.csv")) == len(CLAIMS)
+
+
+def test_only_what_the_models_in_use_ask_for_is_cited(page):
+    cited = {one.get("id").removeprefix("reference-") for one in page.iter("li") if one.get("id")}
+    assert {"KCM16", "DucheneKraus2013", "Robin2003", "Bressan2012", "Hirata2003"} <= cited
+    assert not cited & {"Habets1981", "Offner2023", "Winters2019", "Kaiser1995"}
+
+
+def test_claims_have_a_section_only_where_there_are_some(results, page, tmp_path):
+    ids = {one.get("id") for one in page.iter() if one.get("id")}
+    table = next(one for one in page.iter("table") if one.get("id") == "table-claims")
+    assert "claims" in ids
+    assert len(table.findall("tbody/tr")) == 3
+    one = {"errors_and_biases": results["errors_and_biases"]}
+    without = parsed(write_paper(one, tmp_path))
+    assert not [one for one in without.iter() if "claims" in (one.get("id") or one.get("href") or "")]
+    with pytest.raises(ValueError, match="a claim must have error, number"):
+        write_paper(one, tmp_path, [{"number": 1}])
+    with pytest.raises(ValueError, match="verdict must be one of holds"):
+        write_paper(one, tmp_path, [CLAIMS[0] | {"verdict": "maybe"}])
+
+
+def test_figures_have_the_colours_of_the_page_and_names_of_their_own(folder, page):
+    drawings = list(page.iter("{http://www.w3.org/2000/svg}svg")) or list(page.iter("svg"))
+    assert len(drawings) == 4
+    ids = [one.get("id") for one in page.iter() if one.get("id")]
+    assert len(ids) == len(set(ids))
+    text = (folder / "index.html").read_text(encoding="utf-8").split("<svg")
+    assert sum("var(--blue)" in one for one in text[1:]) >= 3
+    assert sum("drawing card" in one for one in text) == 1  # a map of colours stands on white
+
+
+def test_the_same_numbers_give_the_same_files_and_are_drawn_once(results, tmp_path):
+    stems = ("errors_and_biases", "magnitude")
+    results = {name: results[name] for name in stems}
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
-        write_report(numbers, of_n_stars, tmp_path / name)
-    for name in ("errors_and_biases.ecsv", "errors_and_biases.pdf"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+        write_paper(results, tmp_path / name)
+    files = [f"{stem}.{suffix}" for stem in stems for suffix in ("ecsv", "pdf", "png", "svg")]
+    assert {p.name for p in (tmp_path / "a").iterdir() if p.name[0] != "."} == {*files, "index.html"}
+    for name in (*files, "index.html"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+    times = {name: (tmp_path / "a" / name).stat().st_mtime_ns for name in files if "ecsv" not in name}
+    (tmp_path / "a" / "magnitude.png").unlink()
+    write_paper(results, tmp_path / "a")
+    again = {name: (tmp_path / "a" / name).stat().st_mtime_ns for name in times}
+    assert {name for name in times if times[name] != again[name]} == {
+        f"magnitude.{suffix}" for suffix in ("svg", "pdf", "png")
+    }
 
 
-def test_the_table_and_the_vector_figure_can_be_read(numbers, of_n_stars, tmp_path):
-    write_report(numbers, of_n_stars, tmp_path)
-    table = Table.read(tmp_path / "errors_and_biases.ecsv")
-    assert len(table) == 3 * 3 * 20
-    assert re.search("svg", ElementTree.parse(tmp_path / "errors_and_biases.svg").getroot().tag)
+@pytest.mark.parametrize("fraction", [0.3, "model"])
+def test_a_run_of_one_binary_fraction_has_its_page(tmp_path, fraction):
+    stars = StarsConfig(l=180, b=45, mag=(18, 19), n_drawn=200)
+    config = RunConfig(stars=stars, n_stacks=500, psf=("psf1",), binary_fraction=fraction)
+    found = errors_and_biases(config, tmp_path / "run.zarr")
+    assert found.fraction == pytest.approx(0.3, abs=0.03)
+    path = write_run(of_errors_and_biases(found, KCM16), "run.zarr", tmp_path / "report.html")
+    page = parsed(path)
+    text = words_of(next(one for one in page.iter("main")), skip=("svg", "math"))
+    assert "The run run.zarr" in words_of(next(one for one in page.iter("h1")))
+    assert f"{found.fraction:.0%}".replace("%", " %") in text
+    assert float(found.mean_x) in {float(one.get("value")) for one in page.iter("data")}
 
 
 def test_a_selection_is_drawn_with_all_its_stars():
@@ -176,3 +338,45 @@ def test_a_selection_is_drawn_with_all_its_stars():
         assert sum(patch.get_height() for patch in axis.patches) == 3
         assert axis.get_xlabel()
     assert [t.get_text() for t in figure.axes[2].get_legend().get_texts()] == ["thin disc", "thick disc"]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if executable() is None:
+        pytest.skip("no Chromium is installed")
+    window = Browser()
+    yield window
+    window.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 360])
+def test_a_browser_shows_the_page_without_complaint(browser, folder, width, scheme):
+    browser.show(folder / "index.html", width, prefers_color_scheme=scheme)
+    browser.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    browser.evaluate("dispatchEvent(new Event('resize'))")
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    assert browser.complaints() == []
+    assert [url[:5] for url in browser.requests() if not url.startswith("data:")] == ["file:"]
+    script = (Path(__file__).parent / "accessible.js").read_text(encoding="utf-8")
+    assert browser.evaluate(script) == []
+    columns = browser.evaluate("getComputedStyle(document.querySelector('nav')).position")
+    assert columns == ("sticky" if width == 1280 else "static")
+
+
+def test_a_table_is_copied_by_its_button(browser, folder):
+    browser.show(folder / "index.html", 1280)
+    browser.evaluate("document.querySelector('button[data-copies]').click()")
+    said = "new Promise((done) => setTimeout(() => done(document.getElementById('said').textContent), 300))"
+    assert browser.evaluate(said).startswith("Copied: ")
+    assert browser.complaints() == []
+
+
+def test_print_leaves_the_contents_and_buttons_out_and_is_dark_on_light(browser, folder):
+    browser.show(folder / "index.html", 800, medium="print", prefers_color_scheme="dark")
+    shown = (
+        "[...document.querySelectorAll('nav, button, .tools')].filter((one) => one.checkVisibility()).length"
+    )
+    assert browser.evaluate(shown) == 0
+    assert browser.evaluate("getComputedStyle(document.body).color") == "rgb(0, 0, 0)"
+    assert browser.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"

@@ -270,48 +270,66 @@ def summary(
 
 
 @app.command()
+def report(
+    run: Annotated[Path, typer.Argument(help="Zarr store of a run.", metavar="RUN.zarr")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="HTML file to write.")],
+    bins: Annotated[int, typer.Option(help="Ranges of binary fraction.")] = 20,
+    as_json: Json = False,
+) -> None:
+    """One page about a run that needs no network: figure, numbers, methods, configuration, references."""
+    from porrima.answers import NUMBER_COLUMNS, number_lines
+    from porrima.experiments import numbers_of_run
+    from porrima.findings import of_errors_and_biases
+    from porrima.instruments import KCM16
+    from porrima.report import write_run
+    from porrima.store import open_run
+    from porrima.summary import rows
+
+    if bins < 1:
+        raise InputError("must be at least 1", key="--bins", value=bins)
+    parts = of_errors_and_biases(numbers_of_run(open_run(run), bins), KCM16)
+    page = write_run(parts, run.resolve().name, output)
+    numbers = rows(parts["summary"])
+    result = {"report": str(page), "bins": numbers}
+    show(result, as_json, f"report: {page}", NUMBER_COLUMNS, number_lines(numbers))
+
+
+@app.command()
 def paper(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for figures, tables and the report.")
     ],
     full: Annotated[bool, typer.Option("--full", help="At the paper's own number of stacks.")] = False,
+    psf: Annotated[list[str] | None, typer.Option(help="Another PSF; again for more.")] = None,
+    n_stars: Annotated[int | None, typer.Option(help="In a stack, instead of 40.")] = None,
     seed: Seed = 1,
     as_json: Json = False,
 ) -> None:
-    """The paper's figures of errors and biases, and of the number of stars in a stack, with their numbers."""
+    """The paper's figures with their numbers, and one page about them; what is there already is used again."""
     from porrima.answers import NUMBER_COLUMNS, number_lines
-    from porrima.experiments import (
-        effect_of_n_stars,
-        errors_and_biases,
-        n_stars_configs,
-        paper_config,
-        store_name,
-    )
     from porrima.files import make_folder
     from porrima.machine import peak_memory
-    from porrima.report import write_report
+    from porrima.programme import carried_out, programme
+    from porrima.report import write_paper
     from porrima.summary import rows
+    from porrima.terminal import step
 
-    config, others = paper_config(full=full, seed=seed), n_stars_configs(full=full, seed=seed)
+    experiments = programme(output, full=full, seed=seed, psf=tuple(psf) if psf else None, n_stars=n_stars)
     make_folder(output)
     start = time.perf_counter()
-    n_drawn = sum(c.n_stacks * c.n_stars for c in (config, *others))
-    with Progress(n_drawn, "stars") as progress:
-        numbers = errors_and_biases(
-            config, output / store_name(config), lambda n: progress.advance(n * config.n_stars)
-        )
-        of_n_stars = effect_of_n_stars(others, output, progress.advance)
-    report = write_report(numbers, of_n_stars, output)
+    results = dict(carried_out(experiments, output / "numbers", step))
+    page = write_paper(results, output)
+    first = results["errors_and_biases"]
     result = {
-        "report": str(report),
-        "n_stacks": config.n_stacks,
-        "n_stars": config.n_stars,
-        "n_stars_drawn": n_drawn,
+        "report": str(page),
+        "n_stacks": int(first["findings"]["n_stacks"]),
+        "n_stars": first["curves"].attrs["n_stars"],
+        "n_stars_drawn": sum(one.size for one in experiments if one.unit == "stars"),
         "wall_s": time.perf_counter() - start,
         "peak_memory_mb": peak_memory(),
     }
-    near = [row for row in rows(numbers.summary) if row["f_lo"] <= 0.35 < row["f_hi"]]
-    show(result, as_json, f"report: {report}", NUMBER_COLUMNS, number_lines(near))
+    near = [row for row in rows(first["summary"]) if row["f_lo"] <= 0.35 < row["f_hi"]]
+    show(result, as_json, f"report: {page}", NUMBER_COLUMNS, number_lines(near))
 
 
 @app.command()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from porrima.config import PopulationConfig, RunConfig, parse
-from porrima.galaxy import Robin2003
-from porrima.multiplicity import DucheneKraus2013
+from porrima.archive import source_key
+from porrima.cache import content_key
+from porrima.config import PopulationConfig, RunConfig, canonical, parse
 from porrima.prediction import integrate, population_moments, predict
 from porrima.psf import psf_from_name, sheared_gaussian
 from porrima.response import response
@@ -23,28 +24,29 @@ from porrima.uncertainty import uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     import xarray as xr
     from numpy.typing import NDArray
 
-    from porrima.galaxy import StarCounts
-    from porrima.stars import Stars
+    from porrima.multiplicity import MultiplicityModel
+    from porrima.store import FinishedRun
 
     FloatArray = NDArray[np.float64]
 
 __all__ = [
     "EffectOfNStars", "ErrorsAndBiases", "against_magnitude", "effect_of_n_stars", "errors_and_biases",
-    "galaxy_against_catalog", "n_stars_configs", "paper_config", "population", "store_name",
+    "n_stars_configs", "numbers_of_run", "paper_config", "store_name",
 ]  # fmt: skip
 
 QUICK, FULL = 100_000, 500_000  # stacks; the paper has "hundreds of thousands"
 N_STARS = (40, 750, 2100, 10_000)
 """Stars in the stacks of KCM16 Fig. 5 (count)."""
 
+PAPER_FRACTION = 0.35
+"""Binary fraction at which the paper reads its figures, in [0, 1]."""
+
 N_STARS_QUICK, N_STARS_FULL = 10_000, 100_000  # stacks of each
 N_STARS_PSF = ("psf1", "psf2")
-GAP_RULES = {name: DucheneKraus2013(gap_rule=name) for name in ("lower", "solar")}
 ELLIPTICITIES = (0.02, 0.05, 0.1, 0.15, 0.2)
 """Of the Gaussian PSFs of the magnitude figure, along x (dimensionless)."""
 
@@ -53,15 +55,6 @@ SURVEY_PSFS = {
     "Roman H158": {"name": "roman:H158:SCA01", "pixel": 0.11},
 }
 """PSFs of surveys in the magnitude figure, with pixel and jitter in arcsec."""
-
-MASS_CLASSES = {
-    "below 0.1": (0.0, 0.1),
-    "0.1-0.5": (0.1, 0.5),
-    "0.5-0.7": (0.5, 0.7),
-    "0.7-1.5": (0.7, 1.5),
-    "0.5-1.5": (0.5, 1.5),
-}
-"""Classes of mass of the population figure, in M_sun; the last is the sum of the two before it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,21 +69,26 @@ class ErrorsAndBiases:
         Simulated and predicted, per bin of binary fraction, dimensionless.
     curves, limit : Dataset
         Predicted against binary fraction for the N of the stacks and for N → ∞, dimensionless.
+    fraction : float
+        A binary fraction: `PAPER_FRACTION`, or that of the stacks where all have one; in [0, 1].
     mean_x : float
-        At a binary fraction of 0.35, in arcsec².
+        At that fraction, in arcsec².
     removed_fraction : float
-        Share of resolved pairs among all pairs at 0.35, in [0, 1].
+        Share of resolved pairs among all pairs at that fraction, in [0, 1].
     """
 
     config: RunConfig
     summary: xr.Dataset
     curves: xr.Dataset
     limit: xr.Dataset
+    fraction: float
     mean_x: float
     removed_fraction: float
 
 
-def paper_config(*, full: bool = False, seed: int = 1) -> RunConfig:
+def paper_config(
+    *, full: bool = False, seed: int = 1, psf: tuple[str, ...] | None = None, n_stars: int | None = None
+) -> RunConfig:
     """The setting of KCM16 Sect. 5.1.
 
     Parameters
@@ -99,6 +97,10 @@ def paper_config(*, full: bool = False, seed: int = 1) -> RunConfig:
         At the paper's own number of stacks.
     seed : int
         Of the run.
+    psf : tuple of str, optional
+        Other PSFs than the paper's.
+    n_stars : int, optional
+        Another number of stars in a stack than 40 (count).
 
     Returns
     -------
@@ -115,7 +117,9 @@ def paper_config(*, full: bool = False, seed: int = 1) -> RunConfig:
             "stars": {"l": 180, "b": 45, "band": "i", "mag": [18, 19]},
             "n_stacks": FULL if full else QUICK,
             "seed": seed,
-        },
+        }
+        | ({"psf": psf} if psf else {})
+        | ({"n_stars": n_stars} if n_stars is not None else {}),
     )
 
 
@@ -139,17 +143,42 @@ def errors_and_biases(
         All that the figure shows.
     """
     simulate(config, store, resume=store.exists(), progress=progress)
-    run = open_run(store)
+    return numbers_of_run(open_run(store))
+
+
+def numbers_of_run(run: FinishedRun, bins: int = 20) -> ErrorsAndBiases:
+    """Error and bias of the PSF's shape in any run, simulated and predicted.
+
+    Parameters
+    ----------
+    run : FinishedRun
+        From `store.open_run`.
+    bins : int
+        Ranges of binary fraction (count).
+
+    Returns
+    -------
+    numbers : ErrorsAndBiases
+        Where all stacks have one binary fraction, its curves have that one alone.
+    """
     config, population = run.config, run.population
     integrals = integrate(population)
-    moments = population_moments(population, integrals, np.array([0.35]))
-    curves = predicted_curves(population, config, config.n_stars, integrals=integrals)
+    given = {"uniform": PAPER_FRACTION, "model": None}.get(
+        str(config.binary_fraction), config.binary_fraction
+    )
+    moments = population_moments(population, integrals, None if given is None else np.array([given]))
+    fraction = float(moments.binary_fraction[0]) if given is None else float(given)
+    grid = None if config.binary_fraction == "uniform" else np.array([fraction])
+    curves, limit = (
+        predicted_curves(population, config, n_stars, grid, integrals) for n_stars in (config.n_stars, None)
+    )
     curves.attrs["n_stars"] = config.n_stars
     return ErrorsAndBiases(
         config=config,
-        summary=summarise(run, integrals=integrals),
+        summary=summarise(run, bins=bins, integrals=integrals),
         curves=curves,
-        limit=predicted_curves(population, config, None, integrals=integrals),
+        limit=limit,
+        fraction=fraction,
         mean_x=float(moments.mean_x[0]),
         removed_fraction=float(moments.removed_fraction[0]),
     )
@@ -166,9 +195,12 @@ def store_name(config: RunConfig) -> str:
     Returns
     -------
     name : str
-        Another for another number of stars or stacks, or seed.
+        Another for another configuration, content of a file of a PSF, or state of the source.
     """
-    return f"run-{config.n_stars}-{config.n_stacks}-{config.seed}.zarr"
+    files = [Path(name.split("[")[0]) for name in config.psf]
+    contents = [file.read_bytes() for file in files if file.is_file()]
+    key = content_key(canonical(config), contents, source_key("simulation"))
+    return f"run-{config.n_stars}-{config.n_stacks}-{config.seed}-{key[:8]}.zarr"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,7 +219,9 @@ class EffectOfNStars:
     limit: xr.Dataset
 
 
-def n_stars_configs(*, full: bool = False, seed: int = 1) -> list[RunConfig]:
+def n_stars_configs(
+    *, full: bool = False, seed: int = 1, psf: tuple[str, ...] | None = None
+) -> list[RunConfig]:
     """The settings of KCM16 Fig. 5.
 
     Parameters
@@ -196,6 +230,8 @@ def n_stars_configs(*, full: bool = False, seed: int = 1) -> list[RunConfig]:
         At the paper's own number of stacks: 100 000 of each number of stars, 1.3e9 stars behind two PSFs.
     seed : int
         Of the runs.
+    psf : tuple of str, optional
+        Other PSFs than PSF1 and PSF2.
 
     Returns
     -------
@@ -207,8 +243,8 @@ def n_stars_configs(*, full: bool = False, seed: int = 1) -> list[RunConfig]:
     KCM16
     """
     n_stacks = N_STARS_FULL if full else N_STARS_QUICK
-    common = {"psf": N_STARS_PSF, "n_stacks": n_stacks}
-    base = paper_config(full=full, seed=seed)
+    base = paper_config(full=full, seed=seed, psf=psf or N_STARS_PSF)
+    common = {"n_stacks": n_stacks}
     return [base.model_copy(update=common | {"n_stars": n_stars}) for n_stars in N_STARS]
 
 
@@ -255,151 +291,15 @@ def _in_stars(progress: Callable[[int], None], n_stars: int, n_stacks: int) -> N
     progress(n_stacks * n_stars)
 
 
-def population(
-    magnitude: tuple[float, float] = (16.0, 24.0), band: str = "i", galaxy: Robin2003 | None = None
-) -> xr.Dataset:
-    r"""Share of mass classes and mean binary fraction over the sky (KCM16 Sect. 4.3).
-
-    Parameters
-    ----------
-    magnitude : (float, float)
-        Half-open range, in mag.
-    band : str
-        One of the bands of `porrima.photometry.MainSequence`.
-    galaxy : Robin2003, optional
-        The model; the default one where not given.
-
-    Returns
-    -------
-    dataset : Dataset
-        ``share`` (scan, angle, mass_class) and ``binary_fraction`` (scan, angle, gap_rule), dimensionless,
-        ``bright_limit`` (scan, angle), an upper limit on the share of stars above 1.5 M_sun, and
-        ``n_per_deg2``, along three scans: latitude 15 to 75 deg at l = 0 and 180, longitude at b = 45.
-
-    Notes
-    -----
-    Main-sequence stars, from the integral of `Robin2003.star_counts`: no random numbers.  Shares are of the
-    stars up to 1.5 M_sun, the end of the photometry.  Those above are not counted but limited: at the
-    magnitude of 1.5 M_sun, so nearer and more frequent than they are, and all alive, they would number
-    :math:`\int_{1.5}^\infty m^{-3} dm` over the same integral across the last cell of mass times its stars.
-
-    References
-    ----------
-    KCM16, Robin2003, DucheneKraus2013
-    """
-    import xarray as xr  # noqa: PLC0415  (slow to import, needed for results only)
-
-    model = galaxy or Robin2003()
-    latitude, longitude = np.arange(15.0, 76.0, 5.0), np.linspace(0.0, 360.0, 25)
-    scans = {
-        "l = 0": (np.zeros(latitude.size), latitude),
-        "l = 180": (np.full(latitude.size, 180.0), latitude),
-        "b = 45": (longitude, np.full(longitude.size, 45.0)),
-    }
-    parts = []
-    for name, (l, b) in scans.items():
-        counts = [
-            model.star_counts(x % 360.0, y, np.array(magnitude), band) for x, y in zip(l, b, strict=True)
-        ]
-        part = xr.Dataset(
-            {
-                "share": (("angle", "mass_class"), [_shares(c) for c in counts]),
-                "binary_fraction": (("angle", "gap_rule"), [_binary_fractions(c)[:, 0] for c in counts]),
-                "bright_limit": ("angle", [_bright_limit(c) for c in counts]),
-                "n_per_deg2": ("angle", [c.per_deg2[0] for c in counts]),
-            },
-            coords={
-                "angle": longitude if name == "b = 45" else latitude,
-                "mass_class": list(MASS_CLASSES),
-                "gap_rule": list(GAP_RULES),
-            },
-        )
-        parts.append(part.expand_dims(scan=[name]))
-    dataset = xr.concat(parts, dim="scan", join="outer")
-    dataset.attrs = {"band": band, "magnitude_lo": magnitude[0], "magnitude_hi": magnitude[1]}
-    return dataset
-
-
-def _shares(counts: StarCounts) -> list[float]:
-    stars = counts.by_mass[0] / counts.by_mass[0].sum()
-    return [float(stars[(counts.mass >= lo) & (counts.mass < hi)].sum()) for lo, hi in MASS_CLASSES.values()]
-
-
-def _bright_limit(counts: StarCounts) -> float:
-    """Upper limit on the share of stars above 1.5 M_sun."""
-    last = counts.mass[-1] / np.sqrt(counts.mass[-1] / counts.mass[-2])  # lower edge of the last cell
-    above = 1.5**-2 / (last**-2 - 1.5**-2)
-    return float(above * counts.by_mass[0, -1] / counts.by_mass[0].sum())
-
-
-def _binary_fractions(counts: StarCounts) -> FloatArray:
-    """Mean multiplicity fraction (gap_rule, bin)."""
-    laws = [model.companions(counts.mass) for model in GAP_RULES.values()]
-    return np.stack([counts.mean(law.multiplicity_fraction) for law in laws])
-
-
-def galaxy_against_catalog(
-    stars: Stars,
-    galaxy: Robin2003,
-    direction: tuple[float, float],
-    magnitudes: FloatArray,
-    rng: np.random.Generator,
-) -> xr.Dataset:
-    """The analytic Galaxy beside a catalogue of the same direction, per bin of magnitude.
-
-    Parameters
-    ----------
-    stars : Stars
-        Main-sequence stars of the catalogue, up to 1.5 M_sun, with their area.
-    galaxy : Robin2003
-        The model.
-    direction : (float, float)
-        Galactic longitude and latitude, in deg.
-    magnitudes : (n + 1,) float array
-        Edges of the bins, in mag.
-    rng : numpy.random.Generator
-        For the sampling error of the median distance (200 bootstraps).
-
-    Returns
-    -------
-    dataset : Dataset
-        ``catalog`` and ``galaxy`` (quantity, bin) and ``stderr``, the sampling error of the catalogue:
-        stars per deg², median distance in pc, mean mass in M_sun, mean multiplicity fractions of
-        Duchene & Kraus (2013) by gap rule.
-    """
-    import xarray as xr  # noqa: PLC0415  (slow to import, needed for results only)
-
-    counts = galaxy.star_counts(*direction, magnitudes, stars.band)
-    expected = np.vstack(
-        [counts.per_deg2, counts.median_distance, counts.mean_mass, _binary_fractions(counts)]
-    )
-    value, stderr = np.empty_like(expected), np.empty_like(expected)
-    for k in range(magnitudes.size - 1):
-        here = stars.select(magnitude=(magnitudes[k], magnitudes[k + 1]))
-        n, area = len(here), stars.area or 1.0
-        medians = [np.median(here.distance[rng.integers(0, n, n)]) for _ in range(200)]
-        value[:2, k] = n / area, np.median(here.distance)
-        stderr[:2, k] = np.sqrt(n) / area, np.std(medians)
-        of_star = [here.mass, *(m.companions(here.mass).multiplicity_fraction for m in GAP_RULES.values())]
-        for row, values in enumerate(of_star, start=2):
-            value[row, k], stderr[row, k] = values.mean(), values.std() / np.sqrt(n)
-    names = ["counts", "median_distance", "mean_mass", *(f"fraction_{rule}" for rule in GAP_RULES)]
-    dims = ("quantity", "bin")
-    return xr.Dataset(
-        {"catalog": (dims, value), "stderr": (dims, stderr), "galaxy": (dims, expected)},
-        coords={"quantity": names, "mag_lo": ("bin", magnitudes[:-1]), "mag_hi": ("bin", magnitudes[1:])},
-        attrs={"band": stars.band, "l": direction[0], "b": direction[1], "source": stars.source},
-    )
-
-
 def against_magnitude(
     edges: FloatArray,
-    models: dict[str, DucheneKraus2013],
+    models: dict[str, MultiplicityModel],
     *,
     binary_fraction: float | None = 0.35,
     n_stars: int = 10_000,
     n_drawn: int = 4000,
     seed: int = 1,
+    progress: Callable[[int], None] = lambda _: None,
 ) -> xr.Dataset:
     r"""Mean x and errors of the PSF against magnitude (KCM16 Sect. 5.4), Gaussian PSFs and those of surveys.
 
@@ -417,6 +317,8 @@ def against_magnitude(
         Stars drawn from the analytic Galaxy at l = 180°, b = 45° in each bin (count).
     seed : int
         Of those stars.
+    progress : callable
+        Called with the number of bins of a model done (count).
 
     Returns
     -------
@@ -455,6 +357,7 @@ def against_magnitude(
                 of_psf["limit_e"][i, j, k] = np.hypot(*limit.bias[:2, 0])
                 of_psf["limit_r2"][i, j, k] = abs(limit.bias[2, 0])
                 of_psf["sd_e"][i, j, k], of_psf["sd_r2"][i, j, k] = stack.sd[0, 0], stack.sd[2, 0]
+            progress(1)
     zero = [reply.shape0 for reply in replies]
     return xr.Dataset(
         {name: (("model", "psf", "bin"), values) for name, values in of_psf.items()}

@@ -18,6 +18,7 @@ __all__ = [
     "COLOURS",
     "MARKERS",
     "STYLE",
+    "at_one_fraction",
     "effect_of_n_stars",
     "errors_and_biases",
     "performance",
@@ -125,6 +126,49 @@ def _legend(figure: Figure, axis: Any, curves: xr.Dataset, requirement: Requirem
         handles += axis.plot([], [], **style)
         labels.append(label)
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=8.5)
+
+
+def at_one_fraction(summary: xr.Dataset, requirement: Requirement) -> Figure:
+    """Three panels: bias and scatter of R², e1 and e2 behind each PSF, of stacks with one binary fraction.
+
+    Parameters
+    ----------
+    summary : Dataset
+        From `summary.summarise`, with stacks in one bin: symbols with their standard errors, dimensionless.
+    requirement : Requirement
+        Drawn as dotted lines.
+
+    Returns
+    -------
+    figure : Figure
+        Open symbols are predictions.
+    """
+    here = summary.isel(bin=int(np.argmax(summary["n_stacks"].to_numpy())))
+    psfs = [str(name) for name in summary["psf"].to_numpy()]
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(7.4, max(2.6, 1.4 + 0.5 * len(psfs))), layout="constrained")
+        axes = figure.subplots(1, 3, sharey=True)
+        for axis, (quantity, _, label) in zip(axes, _PANELS, strict=True):
+            for k, (statistic, words) in enumerate((("bias", "bias"), ("sd", "scatter of a stack"))):
+                place = np.arange(len(psfs)) + 0.2 * (k - 0.5)
+                one = here.sel(quantity=quantity)
+                style = {"color": COLOURS[k], "marker": MARKERS[k], "markersize": 4.0, "linestyle": "none"}
+                axis.errorbar(one[statistic], place, xerr=one[f"{statistic}_se"], label=words, **style)
+                axis.plot(
+                    one[f"prediction_{statistic}"], place, label=f"{words}, predicted", **style | {"markersize": 9.0},
+                    markerfacecolor="none",
+                )  # fmt: skip
+            required = requirement.sigma_r2 if quantity == "r2" else requirement.sigma_e
+            if required is not None:
+                axis.axvline(required, color="#b00020", linestyle=":", linewidth=1.2)
+            axis.axvline(0.0, color="0.6", linewidth=0.6, zorder=0)
+            axis.set_xlabel(label)
+            axis.ticklabel_format(axis="x", style="sci", scilimits=(0, 0), useMathText=True)
+        axes[0].set_yticks(range(len(psfs)), psfs)
+        axes[0].set_ylim(len(psfs) - 0.5, -0.5)
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=8.0)
+    return figure
 
 
 def effect_of_n_stars(numbers: xr.Dataset, limit: xr.Dataset, requirement: Requirement) -> Figure:

@@ -1,206 +1,351 @@
-"""The report: one page that needs no network, and the figure and table beside it, from saved numbers only."""
+"""The report: one page that needs no network, and the figures and tables beside it, from saved numbers only."""
 
 from __future__ import annotations
 
-import io
-import math
-from html import escape
-from typing import TYPE_CHECKING
+import json
+import platform
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+import yaml
+from markupsafe import Markup
 
 from porrima import __version__
-from porrima.figures import effect_of_n_stars, errors_and_biases
+from porrima.archive import fingerprint, source_key, versions
+from porrima.bibliography import bibliography, keys_of
+from porrima.cache import content_key
+from porrima.config import RunConfig, parse
+from porrima.diagrams import against_magnitude
+from porrima.drawing import drawing, svg_of
+from porrima.figures import at_one_fraction, effect_of_n_stars, errors_and_biases
 from porrima.files import write_whole
+from porrima.galaxy import Robin2003
 from porrima.instruments import KCM16
 from porrima.io import write_figure, write_rows
+from porrima.page import (
+    Configuration,
+    Page,
+    PageFigure,
+    Section,
+    Table,
+    claims_from,
+    html,
+    plain,
+    quoted,
+    words,
+)  # fmt: skip
+from porrima.shapes import estimator_from_name
+from porrima.star_figures import population
 from porrima.summary import rows
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     import xarray as xr
     from matplotlib.figure import Figure
 
-    from porrima.experiments import EffectOfNStars, ErrorsAndBiases
+    Parts = dict[str, xr.Dataset]
 
-__all__ = ["write_report"]
+__all__ = ["write_paper", "write_run"]
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>Porrima: errors and biases of the PSF from unresolved binary stars</title>
-<style>
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #1b1b1b;
-  background: #fff; }}
-figure {{ margin: 1.5rem 0; }} figure svg {{ max-width: 100%; height: auto; background: #fff; }}
-.wide {{ overflow-x: auto; }}
-table {{ border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }}
-th, td {{ padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap; }}
-caption {{ text-align: left; padding-bottom: 0.4rem; }}
-pre {{ background: #f4f4f4; padding: 0.8rem; white-space: pre-wrap; overflow-wrap: anywhere; }}
-</style>
-</head>
-<body>
-<main>
-<h1>Errors and biases of the PSF from unresolved binary stars</h1>
-<p>{answer}</p>
-<figure>
-{figure}
-<figcaption>Error (left) and bias (right) of the size and the two ellipticity components of a stack of {n_stars} stars,
-{mag} mag in {band}, against the binary fraction of the population, after Kuntzer, Courbin &amp; Meylan (2016), Fig. 4.
-Symbols: {n_stacks} simulated stacks with standard errors; the PSFs are set apart a little. Solid: closed form for
-{n_stars} stars. Dashed: closed form for infinitely many stars. The PSFs share
-the stacks, and so their scatter. Dotted: requirement of {requirement}.</figcaption>
-</figure>
-<h2>Simulation against prediction</h2>
-<p>{agreement}</p>
-<div class="wide">{table}</div>
-<h2>Number of stars in a stack</h2>
-<figure>
-{second_figure}
-<figcaption>Error of the two ellipticity components of stacks of {n_stars_list} stars, after Kuntzer, Courbin &amp;
-Meylan (2016), Fig. 5. Symbols: {n_stacks_each} simulated stacks of each, with standard errors; one set of stacks stands
-behind both PSFs. Solid: closed form. Dashed: closed form for infinitely many stars, the bias that no number of stars
-takes away. Dotted: requirement.</figcaption>
-</figure>
-<p>{second_agreement}</p>
-<p>The whole tables are in <code>errors_and_biases.ecsv</code> and <code>effect_of_n_stars.ecsv</code>, the stacks in
-the Zarr stores beside them.</p>
-<h2>How it was made</h2>
-<p>Stars: {stars}. {pairs}</p>
-<pre>{config}</pre>
-<p>Porrima {version}. Models: Kuntzer, Courbin &amp; Meylan 2016 (arXiv:1512.01549); Duch&ecirc;ne &amp; Kraus 2013;
-Robin et al. 2003; Bressan et al. 2012.</p>
-</main>
-</body>
-</html>
-"""
+_TITLES = {
+    "population": "The stars",
+    "errors_and_biases": "Errors and biases against binary fraction",
+    "effect_of_n_stars": "Number of stars in a stack",
+    "errors_and_biases_kcm16": "The other reading of the multiplicity table",
+    "errors_and_biases_optical": "Optical PSFs",
+    "magnitude": "Against magnitude",
+}
+_ONE = "Bias and scatter at one binary fraction"
+_HEADS = (
+    "PSF", "quantity", "binary fraction", "stacks", "bias", "predicted", "σ", "predicted", "sd", "predicted",
+)  # fmt: skip
+_QUANTITIES = {"r2": Markup("R²"), "e1": Markup("e<sub>1</sub>"), "e2": Markup("e<sub>2</sub>")}
+_WIDEST = 10  # columns shown; all are in the files
+_SCANS = {"l = 0": "latitude at l = 0°", "l = 180": "latitude at l = 180°", "b = 45": "longitude at b = 45°"}
 
 
-def write_report(numbers: ErrorsAndBiases, of_n_stars: EffectOfNStars, folder: Path) -> Path:
-    """Path of the page written, with the figures (SVG, PDF, PNG) and the tables (ECSV) beside it.
+def write_paper(results: Mapping[str, Parts], folder: Path, claims: Sequence[Mapping[str, Any]] = ()) -> Path:
+    """Path of the page of the paper, with its figures (SVG, PDF, PNG) and tables (ECSV) beside it.
 
     Parameters
     ----------
-    numbers : ErrorsAndBiases
-        From `experiments.errors_and_biases`.
-    of_n_stars : EffectOfNStars
-        From `experiments.effect_of_n_stars`.
+    results : dict
+        Datasets of each experiment, from `programme.carried_out`.
     folder : Path
         Where to write; it exists.
+    claims : sequence of dict
+        Records with the keys of `page.Claim`: ``number, statement, paper, porrima, error, verdict, why``.  Without
+        any the section is left out.
 
     Returns
     -------
     page : Path
         ``index.html`` in the folder.
+
+    Raises
+    ------
+    ValueError
+        If a claim is not whole.
     """
-    figures = {
-        "errors_and_biases": errors_and_biases(numbers.summary, numbers.curves, numbers.limit, KCM16),
-        "effect_of_n_stars": effect_of_n_stars(of_n_stars.numbers, of_n_stars.limit, KCM16),
+    stated, sections = claims_from(claims), []
+    for name, parts in results.items():
+        section = _section(name, parts, _drawn(name, parts, folder))
+        for table in section.tables:
+            write_rows(table.records, folder / f"{table.name}.ecsv")
+        sections.append(section)
+    runs = {name: parts["findings"] for name, parts in results.items() if "config" in parts["findings"].attrs}
+    page = Page(
+        title="Errors and biases of the PSF from unresolved binary stars",
+        subtitle="The figures of Kuntzer, Courbin & Meylan (2016), simulated and predicted",
+        sections=tuple(sections),
+        claims=stated,
+        **_said(results["errors_and_biases"]["findings"]),
+        **_provenance(runs),
+    )
+    return _written(page, folder / "index.html")
+
+
+def write_run(parts: Parts, name: str, path: Path) -> Path:
+    """Path of the page of one run.
+
+    Parameters
+    ----------
+    parts : dict
+        From `findings.of_errors_and_biases`.
+    name : str
+        Of the run.
+    path : Path
+        The file, replaced if it exists.
+
+    Returns
+    -------
+    page : Path
+        The same path.
+    """
+    page = Page(
+        title=f"The run {name}",
+        subtitle="What unresolved binary stars do to the PSF of its stacks, simulated and predicted",
+        sections=(_section("errors_and_biases", parts, svg_of(_figure("errors_and_biases", parts))),),
+        **_said(parts["findings"]),
+        **_provenance({name: parts["findings"]}),
+    )
+    return _written(page, path)
+
+
+def _written(page: Page, path: Path) -> Path:
+    text = html(page)
+    write_whole(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+    return path
+
+
+def _said(findings: xr.Dataset) -> dict[str, Any]:
+    """What was asked of a run, and the answer."""
+    found, config = _numbers(findings), _config(findings)
+    return {
+        "asked": tuple(words(name, found, config) for name in ("asked", "setting")),
+        "answer": words("answer", found, config, findings.attrs),
     }
-    for name, figure in figures.items():
-        for suffix in ("svg", "pdf", "png"):
-            write_figure(figure, folder / f"{name}.{suffix}")
-    write_rows(rows(numbers.summary), folder / "errors_and_biases.ecsv")
-    by_n_stars = [
-        {"n_stars": int(n)} | row
-        for n in of_n_stars.numbers["n_stars"].to_numpy()
-        for row in rows(of_n_stars.numbers.sel(n_stars=n))
-    ]
-    write_rows(by_n_stars, folder / "effect_of_n_stars.ecsv")
-    page = folder / "index.html"
-    text = _page(numbers, of_n_stars.numbers, *figures.values())
-    write_whole(page, lambda path: path.write_text(text, encoding="utf-8"))
-    return page
 
 
-def _svg(figure: Figure) -> str:
-    """A figure as it stands in a page."""
-    text = io.StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None})
-    return text.getvalue()[text.getvalue().index("<svg") :]
-
-
-def _page(numbers: ErrorsAndBiases, of_n_stars: xr.Dataset, figure: Figure, second_figure: Figure) -> str:
-    config = numbers.config
-    where = config.stars
-    stars = (
-        f"l = {where.l:g}°, b = {where.b:g}° of the analytic Galaxy"
-        if where.catalog is None
-        else str(where.catalog)
-    )
-    return _PAGE.format(
-        answer=_answer(numbers),
-        figure=_svg(figure),
-        second_figure=_svg(second_figure),
-        n_stars_list=", ".join(str(n) for n in of_n_stars["n_stars"].to_numpy()),
-        n_stacks_each=f"{of_n_stars.attrs['n_stacks']:,}".replace(",", " "),
-        second_agreement=_agreement(of_n_stars),
-        n_stars=config.n_stars,
-        n_stacks=f"{config.n_stacks:,}".replace(",", " "),
-        mag=f"{where.mag[0]:g} to {where.mag[1]:g}",
-        band=escape(where.band or "i"),
-        requirement=escape(KCM16.source),
-        agreement=_agreement(numbers.summary),
-        table=_table(numbers.summary),
-        stars=escape(stars),
-        pairs=f"At a binary fraction of 0.35, {numbers.removed_fraction:.0%} of the pairs are resolved and removed.",
-        config=escape(config.model_dump_json(exclude_none=True, indent=1)),
-        version=__version__,
-    )
-
-
-def _answer(numbers: ErrorsAndBiases) -> str:
-    limit = numbers.limit.isel(psf=0).sel(quantity="r2").interp(binary_fraction=0.35)
-    required = KCM16.sigma_r2 or math.inf
-    share = float(limit["bias"]) / required
-    models = f"{numbers.config.multiplicity.model}, {numbers.config.estimator} moments"
-    return (
-        f"With 35 % binaries the mean of x = f r²/(1 + f)² over the stars is {_power(numbers.mean_x)} arcsec², and the "
-        f"PSF of a stack comes out larger by {_power(float(limit['bias']))} ({models}): "
-        f"{share:.0%} of the size requirement of {_power(required)}. More stars in the stack lower the scatter, "
-        "not this bias."
-    )
-
-
-def _power(value: float) -> str:
-    """Number as a reader of print expects it, with three figures."""
-    mantissa, exponent = f"{value:.2e}".split("e")
-    return f"{mantissa} × 10<sup>{int(exponent)}</sup>".replace("-", "−")
-
-
-def _agreement(summary: xr.Dataset) -> str:
-    pulls = {
-        name: np.abs((summary[name] - summary[f"prediction_{name}"]) / summary[f"{name}_se"]).max().item()
-        for name in ("bias", "sigma", "sd")
-    }
-    checked = int(np.isfinite(summary["bias"]).sum()) * len(pulls)
-    worst = ", ".join(f"{name} {pull:.1f}" for name, pull in pulls.items())
-    failed = float((summary["n_failed"].sum("bin") / summary["n_stacks"].sum("bin")).max())
-    lost = f" {failed:.1%} of the stacks could not be measured and are left out." if failed > 0 else ""
-    return f"Largest difference of {checked} numbers, in standard errors of the simulation: {worst}.{lost}"
-
-
-def _table(summary: xr.Dataset) -> str:
-    names = ("bias", "sigma", "sd")
-    heads = ("PSF", "quantity", "binary fraction", "stacks", *(h for n in names for h in (n, "predicted")))
-    head = "".join(f"<th scope='col'>{name}</th>" for name in heads)
-    body = "".join(
-        f"<tr><td>{escape(row['psf'])}</td><td>{row['quantity']}</td>"
-        f"<td>{row['f_lo']:.2f}–{row['f_hi']:.2f}</td><td>{row['n_stacks']}</td>"
-        + "".join(
-            f"<td>{_with_error(row[name], row[f'{name}_se'])}</td><td>{row[f'prediction_{name}'] * 1e3:.4f}</td>"
-            for name in names
+def _provenance(runs: Mapping[str, xr.Dataset]) -> dict[str, Any]:
+    """Configurations, versions and references of some runs."""
+    keys = {"KCM16"}.union(*(_keys(_config(findings)) for findings in runs.values()))
+    configurations = [
+        Configuration(
+            name=_TITLES.get(name, name),
+            file=f"{name}.yaml",
+            text=yaml.safe_dump(json.loads(findings.attrs["config"]), sort_keys=False, allow_unicode=True),
         )
-        + "</tr>\n"
-        for row in rows(summary)
+        for name, findings in runs.items()
+    ]
+    return {
+        "configurations": tuple(configurations),
+        "versions": {"porrima": __version__, "python": platform.python_version()} | versions(),
+        "references": bibliography(keys),
+    }
+
+
+def _keys(config: RunConfig) -> set[str]:
+    """Papers that the models of a run ask to be cited."""
+    companions = config.multiplicity.build()
+    keys = keys_of(companions, config.photometry.build(), estimator_from_name(config.estimator))
+    keys |= {"MoeDiStefano2017"} if getattr(companions, "eccentricity", "") == "mds17" else set()
+    keys |= {"Moe2019"} if getattr(companions, "metallicity", "") == "moe19" else set()
+    return keys if config.stars.catalog else keys | keys_of(Robin2003)
+
+
+def _config(findings: xr.Dataset) -> RunConfig:
+    return parse(RunConfig, json.loads(findings.attrs["config"]))
+
+
+def _numbers(findings: xr.Dataset) -> dict[str, Any]:
+    """Findings as plain numbers; those over an axis by its labels."""
+    return {
+        str(name): {
+            str(label): float(one)
+            for label, one in zip(values[values.dims[0]].to_numpy(), values, strict=True)
+        }
+        if values.dims
+        else float(values)
+        for name, values in findings.data_vars.items()
+    }
+
+
+def _drawn(name: str, parts: Parts, folder: Path) -> str:
+    """The figure of an experiment as SVG, drawn to its files unless they show the same numbers already."""
+    files = [folder / f"{name}.{suffix}" for suffix in ("svg", "pdf", "png")]
+    note = folder / f".{name}.key"
+    key = content_key(fingerprint(parts), source_key("figures", "star_figures", "diagrams", "drawing"))
+    if not all(file.is_file() for file in (*files, note)) or note.read_text(encoding="ascii") != key:
+        figure = _figure(name, parts)
+        svg = svg_of(figure)
+        write_whole(files[0], lambda unfinished: unfinished.write_text(svg, encoding="utf-8"))
+        for file in files[1:]:
+            write_figure(figure, file)
+        write_whole(note, lambda unfinished: unfinished.write_text(key, encoding="ascii"))
+    return files[0].read_text(encoding="utf-8")
+
+
+def _section(name: str, parts: Parts, svg: str) -> Section:
+    """All that the page says of an experiment."""
+    findings, kind = parts["findings"], _kind(name, parts)
+    config = _config(findings) if "config" in findings.attrs else None
+    about = {key: value for part in parts.values() for key, value in part.attrs.items()} | {
+        "experiment": name
+    }
+    label, caption, text = (
+        words(f"{kind}_{piece}", _numbers(findings), config, about) for piece in ("label", "caption", "text")
     )
-    caption = "<caption>Per PSF, quantity and bin, in units of 10<sup>−3</sup></caption>"
-    return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    shown = PageFigure(
+        name=name,
+        label=label,
+        drawing=drawing(svg, name, label.striptags(), caption.striptags()),
+        caption=caption,
+    )
+    title = _ONE if kind == "one" else _TITLES[name]
+    make = _plain if kind in ("population", "magnitude") else _statistics
+    table = make(name, title, _records(kind, parts))
+    return Section(name=name.replace("_", "-"), title=title, text=(text,), figures=(shown,), tables=(table,))
 
 
-def _with_error(value: float, error: float) -> str:
-    return f"{value * 1e3:.4f} ± {error * 1e3:.4f}"
+def _kind(name: str, parts: Parts) -> str:
+    """What an experiment is like: its words and its figure go by it."""
+    if name in ("population", "magnitude"):
+        return name
+    if name == "effect_of_n_stars":
+        return "n_stars"
+    return "errors" if _config(parts["findings"]).binary_fraction == "uniform" else "one"
+
+
+def _figure(name: str, parts: Parts) -> Figure:
+    kind = _kind(name, parts)
+    if kind == "population":
+        return population(parts["sky"])
+    if kind == "magnitude":
+        return against_magnitude(parts["magnitude"], KCM16)
+    if kind == "n_stars":
+        return effect_of_n_stars(parts["numbers"], parts["limit"], KCM16)
+    if kind == "errors":
+        return errors_and_biases(parts["summary"], parts["curves"], parts["limit"], KCM16)
+    return at_one_fraction(parts["summary"], KCM16)
+
+
+def _records(kind: str, parts: Parts) -> list[dict[str, Any]]:
+    """The table of an experiment, with all its digits."""
+    if kind == "population":
+        return list(_by_direction(parts["sky"]))
+    if kind == "magnitude":
+        return list(_by_magnitude(parts["magnitude"]))
+    if kind == "n_stars":
+        numbers = parts["numbers"]
+        stars = numbers["n_stars"].to_numpy().tolist()
+        return [{"n_stars": n} | row for n in stars for row in rows(numbers.sel(n_stars=n))]
+    return rows(parts["summary"])
+
+
+def _by_direction(sky: xr.Dataset) -> Iterator[dict[str, Any]]:
+    """One record for each direction of each scan."""
+    for scan in sky["scan"].to_numpy().tolist():
+        here = sky.sel(scan=scan).dropna("angle", subset=["n_per_deg2"])
+        for k in range(here.sizes["angle"]):
+            one = here.isel(angle=k)
+            yield (
+                {"along": _SCANS[scan], "angle": float(one["angle"])}
+                | {
+                    f"stars {kind}": float(one["share"].sel(mass_class=kind))
+                    for kind in one["mass_class"].to_numpy()
+                }
+                | {
+                    f"binary fraction, {rule} row": float(one["binary_fraction"].sel(gap_rule=rule))
+                    for rule in one["gap_rule"].to_numpy()
+                }
+                | {"stars per deg²": float(one["n_per_deg2"])}
+            )
+
+
+def _by_magnitude(data: xr.Dataset) -> Iterator[dict[str, Any]]:
+    """One record for each model and bin."""
+    for model in data["model"].to_numpy().tolist():
+        for k in range(data.sizes["bin"]):
+            one = data.sel(model=model).isel(bin=k)
+            names = ("mag_lo", "mag_hi", "mean_x", "mean_x_low", "mean_x_high")
+            yield (
+                {"model": model}
+                | {name: float(one[name]) for name in names}
+                | {
+                    f"{name}, {psf}": float(one[name].sel(psf=psf))
+                    for name in ("limit_e", "limit_r2")
+                    for psf in one["psf"].to_numpy()
+                }
+            )
+
+
+def _statistics(name: str, label: str, records: list[dict[str, Any]]) -> Table:
+    """Bias, error and scatter with their standard errors beside the predictions."""
+    many = "n_stars" in records[0]
+    shown = [
+        [
+            *([plain(row["n_stars"])] if many else []),
+            row["psf"],
+            _QUANTITIES[row["quantity"]],
+            Markup("{}–{}").format(plain(row["f_lo"]), plain(row["f_hi"])),
+            plain(row["n_stacks"]),
+            *(cell for one in ("bias", "sigma", "sd") for cell in _compared(row, one)),
+        ]
+        for row in records
+    ]
+    return Table(
+        name=name,
+        label=label,
+        caption=Markup("Bias, rms error σ and scatter sd, with standard errors, in units of 10<sup>−3</sup>"),
+        heads=(*(("stars",) if many else ()), *_HEADS),
+        rows=shown,
+        n_labels=3 if many else 2,
+        records=records,
+    )
+
+
+def _compared(row: dict[str, Any], name: str) -> tuple[Markup, Markup]:
+    """A simulated number with its standard error, and the predicted one."""
+    value, error, predicted = (
+        quoted(row[key], 4, scale=1e-3, fixed=True) for key in (name, f"{name}_se", f"prediction_{name}")
+    )
+    return Markup("{} ± {}").format(value, error), predicted
+
+
+def _plain(name: str, label: str, records: list[dict[str, Any]]) -> Table:
+    """Records as they are, with three figures; the first columns of them."""
+    heads = tuple(records[0])[:_WIDEST]
+    return Table(
+        name=name,
+        label=label,
+        caption=words(f"{name}_table", {}),
+        heads=heads,
+        rows=[
+            [row[head] if isinstance(row[head], str) else quoted(row[head]) for head in heads]
+            for row in records
+        ],
+        n_labels=1,
+        records=records,
+    )

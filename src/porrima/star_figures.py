@@ -85,7 +85,7 @@ def population(dataset: xr.Dataset) -> Figure:
     Parameters
     ----------
     dataset : Dataset
-        From `experiments.population`, dimensionless against angles in deg.
+        From `star_experiments.population`, dimensionless against angles in deg.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def galaxy_against_catalog(datasets: list[xr.Dataset]) -> Figure:
     Parameters
     ----------
     datasets : list of Dataset
-        One column of panels each, from `experiments.galaxy_against_catalog`: per deg² and mag, pc, M_sun.
+        One column of panels each, from `star_experiments.galaxy_against_catalog`: per deg² and mag, pc, M_sun.
 
     Returns
     -------

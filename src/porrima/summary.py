@@ -199,20 +199,26 @@ def rows(summary: xr.Dataset) -> list[dict[str, Any]]:
         Keys ``psf, quantity, f_lo, f_hi, n_stacks, n_failed`` (stacks that could not be measured, and are left
         out) and `STATISTICS`, dimensionless; NaN where fewer than two stacks are left.
     """
+    psfs, quantities = summary["psf"].to_numpy().tolist(), summary["quantity"].to_numpy().tolist()
+    low, high, n_stacks = (summary[name].to_numpy().tolist() for name in ("f_lo", "f_hi", "n_stacks"))
+    n_failed = summary["n_failed"].to_numpy().tolist()
+    numbers = {
+        name: summary[name].transpose("psf", "quantity", "bin").to_numpy().tolist() for name in STATISTICS
+    }
     return [
         {
             "psf": str(psf),
             "quantity": quantity,
-            "f_lo": float(summary["f_lo"][k]),
-            "f_hi": float(summary["f_hi"][k]),
-            "n_stacks": int(summary["n_stacks"][k]),
-            "n_failed": int(summary["n_failed"].sel(psf=psf)[k]),
+            "f_lo": low[k],
+            "f_hi": high[k],
+            "n_stacks": n_stacks[k],
+            "n_failed": n_failed[p][k],
         }
-        | {name: float(summary[name].sel(psf=psf, quantity=quantity)[k]) for name in STATISTICS}
-        for psf in summary["psf"].to_numpy()
+        | {name: values[p][quantities.index(quantity)][k] for name, values in numbers.items()}
+        for p, psf in enumerate(psfs)
         for quantity in ("r2", "e1", "e2")
-        for k in range(summary.sizes["bin"])
-        if int(summary["n_stacks"][k]) > 0
+        for k in range(len(n_stacks))
+        if n_stacks[k] > 0
     ]
 
 

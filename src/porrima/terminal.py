@@ -6,15 +6,19 @@ import json
 import math
 import sys
 import time
+from contextlib import contextmanager
 from datetime import timedelta
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich import box, progress
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-__all__ = ["Progress", "show"]
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+__all__ = ["Progress", "show", "step"]
 
 _QUIET = 10.0  # s between two lines where there is no terminal, at least
 _STEP = 0.01  # share of the whole between them, at least
@@ -78,6 +82,39 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         if self._bar.live.is_started:
             self._bar.stop()
+
+
+@contextmanager
+def step(name: str, size: int, unit: str, there: bool) -> Iterator[Callable[[int], None]]:
+    """Tell of one of several steps: its name, how far it is, and that it is done.
+
+    Parameters
+    ----------
+    name : str
+        Of the step.
+    size : int
+        How much there is to do (count).
+    unit : str
+        Of what.
+    there : bool
+        Whether it was done before.
+
+    Yields
+    ------
+    advance : callable
+        Given how much more is done (count).
+
+    Returns
+    -------
+    None
+        A context manager.
+    """
+    print(f"{name}: {'as it was' if there else f'{size} {unit}'}", file=sys.stderr, flush=True)
+    start = time.monotonic()
+    with Progress(size, unit) as progress:
+        yield progress.advance
+    if not there:
+        print(f"{name}: done in {time.monotonic() - start:.1f} s", file=sys.stderr, flush=True)
 
 
 def _short(value: float) -> str:

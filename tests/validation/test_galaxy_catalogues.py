@@ -9,13 +9,13 @@ import pytest
 
 from data_files import data_file
 from porrima.catalogs import read_catalog
-from porrima.experiments import galaxy_against_catalog, population
 from porrima.galaxy import Robin2003
 from porrima.multiplicity import MULTIPLICITY, multiplicity_scale
 from porrima.photometry import MainSequence, magnitudes
 from porrima.populations import COMPONENTS, LOG_MASS
 from porrima.prediction import integrate
 from porrima.sightlines import sightline
+from porrima.star_experiments import galaxy_against_catalog, population
 from porrima.star_figures import galaxy_against_catalog as draw_comparison
 from porrima.systems import Population
 
