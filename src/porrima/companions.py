@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CompanionLaw", "MassRangeWarning", "MultiplicityModel", "RowErrors", "check_option", "multiplicity_scale",
-    "warn_of_masses",
+    "scale_from", "scales_reached", "warn_of_masses",
 ]  # fmt: skip
 
 
@@ -309,11 +309,24 @@ def multiplicity_scale(
     ----------
     KCM16
     """
-    wanted = np.asarray(binary_fraction, dtype=float)
-    if np.any((wanted < 0) | (wanted > 1) | ~np.isfinite(wanted)):
-        raise ValueError(
-            f"binary_fraction must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}"
-        )
+    return scale_from(scales_reached(multiplicity_fraction, abundance), binary_fraction)
+
+
+def scales_reached(
+    multiplicity_fraction: FloatArray, abundance: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Binary fractions between which the factor of `multiplicity_scale` is linear in them.
+
+    Parameters
+    ----------
+    multiplicity_fraction, abundance : (n,) float array
+        As for `multiplicity_scale`.
+
+    Returns
+    -------
+    binary_fraction, scale : (m,) float array
+        Ascending; dimensionless.
+    """
     order = np.argsort(multiplicity_fraction, kind="stable")
     ascending = multiplicity_fraction[order]
     number = np.ones_like(ascending) if abundance is None else abundance[order]
@@ -323,9 +336,36 @@ def multiplicity_scale(
     number_below = np.concatenate([[0.0], np.cumsum(number)])
     above = number_below[-1] - number_below[first]
     reached = np.concatenate([[0.0], ((sum_below / values + above) / number_below[-1])[::-1]])
-    if np.any(wanted > reached[-1] * (1 + 1e-12)):
+    return reached, np.concatenate([[0.0], 1.0 / values[::-1]])
+
+
+def scale_from(reached: tuple[FloatArray, FloatArray], binary_fraction: FloatArray) -> FloatArray:
+    """The factor of `multiplicity_scale` from `scales_reached`.
+
+    Parameters
+    ----------
+    reached : pair of (m,) float array
+        From `scales_reached`.
+    binary_fraction : (k,) float array
+        Wanted, in [0, 1].
+
+    Returns
+    -------
+    scale : (k,) float array
+        Dimensionless.
+
+    Raises
+    ------
+    ValueError
+        As `multiplicity_scale`.
+    """
+    wanted = np.asarray(binary_fraction, dtype=float)
+    if np.any((wanted < 0) | (wanted > 1) | ~np.isfinite(wanted)):
         raise ValueError(
-            f"binary_fraction must be at most {reached[-1]:.6g} for these stars, got {wanted.max()}"
+            f"binary_fraction must be in [0, 1], got {wanted[~((wanted >= 0) & (wanted <= 1))][0]}"
         )
-    scale: FloatArray = np.interp(wanted, reached, np.concatenate([[0.0], 1.0 / values[::-1]]))
+    most = reached[0][-1]
+    if np.any(wanted > most * (1 + 1e-12)):
+        raise ValueError(f"binary_fraction must be at most {most:.6g} for these stars, got {wanted.max()}")
+    scale: FloatArray = np.interp(wanted, *reached)
     return scale

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from porrima.companions import multiplicity_scale
+from porrima.companions import scale_from, scales_reached
 from porrima.errors import InputError
 from porrima.moments import KernelMoments, moments_of_points
 from porrima.units import to_internal
@@ -140,7 +141,7 @@ class Population:
         return self.stars if first.size == len(self.stars) else self.stars.take(first)
 
     def scale(self, binary_fraction: FloatArray | None) -> FloatArray:
-        """Factor on all multiplicity fractions for each wanted binary fraction; see `multiplicity_scale`.
+        """Factor on all multiplicity fractions for each wanted binary fraction; see `companions.multiplicity_scale`.
 
         Parameters
         ----------
@@ -154,7 +155,13 @@ class Population:
         """
         if binary_fraction is None:
             return np.ones(1)
-        return multiplicity_scale(self.law.multiplicity_fraction, binary_fraction, self.abundance)
+        return scale_from(_scales_reached(self), binary_fraction)
+
+
+@lru_cache(maxsize=4)
+def _scales_reached(population: Population) -> tuple[FloatArray, FloatArray]:
+    """Of a population that is drawn from again and again."""
+    return scales_reached(population.law.multiplicity_fraction, population.abundance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
