@@ -188,7 +188,7 @@ def coefficient_polynomial(n: int, m: int = 0) -> FloatArray:
     return out
 
 
-def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegrals:
+def integrate(population: Population, intervals: int = _INTERVALS, is_rough: bool = False) -> PairIntegrals:
     r"""Expectations over companions by quadrature: mass ratio by Simpson's rule, orientation by Gauss's.
 
     Parameters
@@ -197,6 +197,8 @@ def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegr
         Stars, their companions' law, the cut and the selection.
     intervals : int
         Of Simpson's rule, a multiple of four (count).
+    is_rough : bool
+        Whether every other node of a selection will do: then both rules have these, and no error of it is known.
 
     Returns
     -------
@@ -212,15 +214,15 @@ def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegr
     screen = screen_of(population)
     joint = None
     if not screen.is_empty:
-        joint = np.stack(
-            [
-                joint_powers(
-                    population, screen, rule, intervals // (1 + rule), starts_of_mass_ratios(population.law),
-                    separations_below(population, rule),
-                )
-                for rule in (0, 1)
-            ]
-        )  # fmt: skip
+        start, rules = starts_of_mass_ratios(population.law), (1,) if is_rough else (0, 1)
+        found = [
+            joint_powers(
+                population, screen, rule, intervals // (1 if is_rough else 1 + rule), start,
+                separations_below(population, rule),
+            )
+            for rule in rules
+        ]  # fmt: skip
+        joint = np.stack([found[0], found[-1]])
     return PairIntegrals(
         cut=population.cut,
         coefficient=coefficient_moments(population, intervals),
