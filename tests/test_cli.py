@@ -482,3 +482,38 @@ def test_a_run_that_had_to_stop_is_not_wrong_input(porrima, monkeypatch, config,
     monkeypatch.setattr("porrima.simulation.simulate", stopped)
     code, out, err = porrima("simulate", config, "-o", tmp_path / "run.zarr")
     assert (code, out, err) == (1, "", "error: run.zarr: cannot be written (No space left on device)\n")
+
+
+@pytest.mark.parametrize(
+    ("selection", "message"),
+    [
+        ("{detection: euclid}", "selection.detection: must be 'euclid-vis' or 'roman-h158', got euclid"),
+        ("[{gaia: dr3}, {clp: 1}]", "selection.1.clp: is not a key (did you mean clip?)"),
+        ("[{gaia: dr3", "--selection: must be a file, {clip: value, key: value} or a list of such"),
+        ("{detection: euclid-vis, psf: psf7}", "psf: must be one of psf0, psf1"),
+    ],
+)
+def test_a_wrong_selection_ends_in_one_line(porrima, stars_file, selection, message):
+    given = ("--catalog", stars_file, "--mag", 18, 19, "--selection", selection)
+    for command in (("predict", "--psf", "psf0"), ("budget", "--instrument", "kcm16")):
+        code, out, err = porrima(*command, *given)
+        assert (code, out) == (2, "")
+        assert err.count("\n") == 1
+        assert message in err
+
+
+def test_budget_and_correction_are_of_the_stars_that_a_selection_keeps(porrima, stars_file, tmp_path):
+    patches = tmp_path / "patches.csv"
+    patches.write_text("r2,n_stars\n6.785e-3,2000\n")
+    chosen = "[{clip: 0.01}, {gaia: dr3}]"
+    given = ("--catalog", stars_file, "--mag", 18, 19, "--selection", chosen, "--json")
+    known = json.loads(porrima("predict", "--psf", "psf1", *given)[1])
+    found = json.loads(porrima("budget", "--instrument", "kcm16", *given)[1])
+    assert found["bins"][0]["eta"] == pytest.approx(known["eta"], rel=1e-9)
+    assert {row["widest_cut"] for row in found["verdicts"]} == {None}
+    result = json.loads(porrima("correct", patches, "--instrument", "kcm16", *given)[1])
+    assert result["populations"][0]["eta"] == pytest.approx(known["eta"], rel=1e-9)
+    assert [list(one) for one in result["configuration"]["selection"]] == [["clip"], ["gaia"]]
+    code, _, err = porrima("correct", patches, "--instrument", "kcm16", "--method", "fields", *given)
+    assert code == 2
+    assert "--selection: goes with --method predict alone" in err

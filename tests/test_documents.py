@@ -5,6 +5,7 @@ import json
 import re
 import shlex
 import sys
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from porrima.config import (
     StarsConfig,
     parse,
 )  # fmt: skip
+from porrima.criteria import OPTIONS
 from porrima.instruments import SURVEYS
 from porrima.multiplicity import MULTIPLICITY
 from porrima.patches import COLUMNS
@@ -167,6 +169,7 @@ def test_every_key_of_the_configuration_is_documented():
     expected = {f"stars.{name}" for name in StarsConfig.model_fields}
     expected |= set(RunConfig.model_fields) - {"stars"}
     expected |= set(Multiplicity.model_fields) | set(Photometry.model_fields)
+    expected |= {*chain.from_iterable(OPTIONS.values()), *(f"selection.{kind}" for kind in OPTIONS)}
     assert not {name for name in expected if f"`{name}`" not in table}
 
 

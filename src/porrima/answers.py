@@ -123,8 +123,8 @@ def population_config(**options: Any) -> PopulationConfig:
             options[name] = _model_with_options(name, options[name])
     chosen = options.get("selection")
     if chosen is not None:
-        braces = str(chosen).startswith("{")
-        options["selection"] = _model_with_options("selection", chosen) if braces else {"table": chosen}
+        is_yaml = str(chosen).startswith(("{", "["))
+        options["selection"] = _model_with_options("selection", chosen) if is_yaml else {"table": chosen}
     given = {key: value for key, value in options.items() if value is not None}
     stars = {key: value for key, value in given.items() if key in where}
     rest = {key: value for key, value in given.items() if key not in where}
@@ -137,7 +137,7 @@ def _model_with_options(name: str, text: str) -> Any:
         return yaml.safe_load(text)
     except yaml.YAMLError:
         rule = (
-            "a file or {clip: value, key: value}"
+            "a file, {clip: value, key: value} or a list of such"
             if name == "selection"
             else "a name or {model: name, option: value}"
         )

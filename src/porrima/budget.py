@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from porrima.photometry import MassLuminosity
     from porrima.prediction import Prediction
     from porrima.response import Response
+    from porrima.selection import Selection
     from porrima.shear import ShearResponse
     from porrima.stars import Stars
     from porrima.uncertainty import Uncertainty
@@ -78,6 +79,8 @@ class Setting:
         Of a method that fits galaxies with the stacked PSF.
     seen : Galaxies, optional
         Sizes as a method sees them that subtracts moments of the PSF by the same estimator.
+    selection : Selection, optional
+        What else the survey rejects; other cuts are then not tried.
     """
 
     requirement: Requirement
@@ -89,6 +92,7 @@ class Setting:
     binary_fraction: float | None = None
     fit: ShearResponse | None = None
     seen: Galaxies | None = None
+    selection: Selection | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,8 +184,9 @@ def budget(setting: Setting, bins: Sequence[tuple[tuple[float, float], Stars]]) 
 
 def _of_bin(setting: Setting, magnitude: tuple[float, float], stars: Stars) -> MagnitudeBin:
     population = Population.of(
-        stars, multiplicity=setting.multiplicity, photometry=setting.photometry, cut=setting.cut
-    )
+        stars, multiplicity=setting.multiplicity, photometry=setting.photometry, cut=setting.cut,
+        selection=setting.selection,
+    )  # fmt: skip
     integrals = integrate(population)
     known = uncertainty(
         stars,
@@ -192,6 +197,7 @@ def _of_bin(setting: Setting, magnitude: tuple[float, float], stars: Stars) -> M
         binary_fraction=setting.binary_fraction,
         n_stars=setting.n_stars,
         integrals=integrals,
+        selection=setting.selection,
     )
     if np.any(np.isnan(known.prediction.bias)):
         rule = (
@@ -296,6 +302,8 @@ def _widest_cuts(
 ) -> dict[str, float]:
     """Widest cut that meets the requirements of each group, between cuts that are tried, linear in logarithms."""
     required = [s for s in shares if s.required is not None]
+    if setting.selection is not None:
+        return dict.fromkeys((s.group for s in required), math.nan)
     step = math.ceil(len(stars) / MOST_STARS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MassRangeWarning)

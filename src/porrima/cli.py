@@ -32,6 +32,7 @@ from porrima.options import (
     PixelScale,
     Psf,
     ReaderOptions,
+    Rejected,
     Seed,
     table_of,
 )  # fmt: skip
@@ -153,9 +154,7 @@ def predict(
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
     cut: Annotated[float, typer.Option(help="Separation from which a pair is resolved [arcsec].")] = 0.05,
-    selection: Annotated[
-        str | None, typer.Option(help="Table of what is rejected, or {clip: T, noise: SIGMA, ...}.")
-    ] = None,
+    selection: Rejected = None,
     stack_weight: Annotated[str, typer.Option(help="equal, or flux.")] = "equal",
     colour: Colour = None,
     seed: Seed = 1,

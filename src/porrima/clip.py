@@ -279,8 +279,9 @@ class Clip:
 
     Notes
     -----
-    As every selection, averaged over the position angle: behind a PSF that is not round pairs along it and across are
-    clipped at separations that differ by half a per cent, and their mean ellipticity by as little.
+    As every selection, averaged over the position angle.  Behind a PSF that is not round, pairs along it and across
+    are clipped at separations that differ by less than 1 %; what their turned kernels add to the mean ellipticity is
+    left out: (4 ± 2) % of its bias behind ``optical1`` at a threshold of 0.8 %, and (1 ± 2) % behind ``psf1``.
     """
 
     response: Response

@@ -14,10 +14,10 @@ import numpy as np
 from numba import njit, prange
 from scipy.special import ndtr
 
-from porrima.clip import Noise, OwnShape, score, shape_grid
+from porrima.clip import Noise, score, shape_grid
 from porrima.errors import InputError
 from porrima.integrals import separation_moments, separations_below, starts_of_mass_ratios
-from porrima.kept import cell_moments, kept_cells, mass_ratio_rule
+from porrima.kept import cell_moments, kept_cells, mass_ratio_rule, row_of_scores
 from porrima.photometry import magnitude_on_track
 from porrima.screen import FOUR_Y, SQUARE, flux_ratio_of, magnitude_nodes
 
@@ -125,7 +125,6 @@ def clip_curve(
     """
     sigma = (noise or Noise()).at(counts.magnitude)[:, None, None]
     own = shape_grid(response, quantity, counts.cut * np.sqrt(SQUARE), flux_ratio_of(FOUR_Y))
-    own = OwnShape(*(_between(counts.four_y, part) for part in own))
     sums, wrong = np.empty((threshold.size, _POWERS)), np.empty(threshold.size)
     for k, t in enumerate(np.asarray(threshold, dtype=float)):
         scores = (
@@ -134,7 +133,7 @@ def clip_curve(
             else np.full((sigma.size, *own.mean.shape), -math.inf)
         )
         scores = np.maximum(scores, -1e300)
-        sums[k] = _kept_sums(scores, counts.powers)
+        sums[k] = _kept_sums(scores, FOUR_Y, counts.four_y, counts.powers)
         wrong[k] = counts.single @ ndtr(scores[:, 0, 0])
     singles, inside = counts.single.sum(), counts.pairs - counts.resolved
     kept = singles - wrong + sums[:, 0]
@@ -149,20 +148,17 @@ def clip_curve(
     )
 
 
-def _between(four_y: FloatArray, values: FloatArray) -> FloatArray:
-    """Values (n_f, n_r) on the screen's nodes of 4 y at others, between which they are linear."""
-    return np.stack([np.interp(four_y, FOUR_Y, column) for column in values.T], axis=1)
-
-
 @njit(cache=True, parallel=True)
-def _kept_sums(scores, powers):  # type: ignore[no-untyped-def]
-    """Sums over all cells of what is kept of each power."""
-    out = np.zeros((scores.shape[1], powers.shape[4]))
-    for f in prange(scores.shape[1]):
+def _kept_sums(scores, nodes, four_y, powers):  # type: ignore[no-untyped-def]
+    """Sums over all cells of what is kept of each power, by scores on fewer nodes of 4 y."""
+    out = np.zeros((four_y.size, powers.shape[4]))
+    for f in prange(four_y.size):
         mean, lean = np.empty(powers.shape[3]), np.empty(powers.shape[3])
+        row = np.empty(powers.shape[3] + 1)
         for m in range(powers.shape[0]):
             mean[:], lean[:] = 1.0, 0.0
-            kept_cells(True, scores[min(m, scores.shape[0] - 1), f], mean, lean)
+            row_of_scores(scores[min(m, scores.shape[0] - 1)], nodes, four_y[f], row)
+            kept_cells(True, row, mean, lean)
             for c in range(mean.size):
                 for k in range(out.shape[1]):
                     out[f, k] += mean[c] * powers[m, f, 0, c, k] + lean[c] * powers[m, f, 1, c, k]
@@ -201,73 +197,77 @@ def count_pairs(population: Population, binary_fraction: float | None = None) ->
     magnitude, node = magnitude_nodes(population.stars.magnitude)
     low = np.log10(FOUR_Y[1])
     four_y = np.append(0.0, np.logspace(low, 0.0, (FOUR_Y.size - 2) * _FINER + 1))
-    powers = np.zeros((magnitude.size, four_y.size, 2, SQUARE.size - 1, _POWERS))
-    below, start = separations_below(population, 0), np.append(starts_of_mass_ratios(law), law.star.size)
-    for part in np.array_split(np.arange(start.size - 1), max(1, law.star.size // _ROWS)):
+    powers = np.zeros((_POWERS, magnitude.size, four_y.size, 2 * (SQUARE.size - 1)))
+    below, start = (
+        separations_below(population, 0, _POWERS),
+        np.append(starts_of_mass_ratios(law), law.star.size),
+    )
+    order = np.argsort(node[start[:-1]], kind="stable")
+    for part in np.array_split(order, max(1, law.star.size // _ROWS)):
         own = start[part]
-        rows = np.arange(own[0], start[part[-1] + 1])
-        cells = cell_moments(below(rows, 0.5 * np.log10(SQUARE[1:])), SQUARE)[..., :_POWERS]
+        at = np.empty((_POWERS, own.size, four_y.size))
         _count(
             tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index[own], tracks.weight[own],
             population.stars.mass[own], law.mass_ratio_min[own], law.mass_ratio_max[own],
-            law.mass_ratio_exponent[own], law.mass_ratio[own], _INTERVALS, four_y, node[own],
-            start[part[0] : part[-1] + 2] - own[0], (number * pair)[rows], cells, powers,
+            law.mass_ratio_exponent[own], law.mass_ratio[own], _INTERVALS, four_y, at,
         )  # fmt: skip
-    inside = separation_moments(population)[0, :, 0]
+        length = start[part + 1] - own
+        first = np.cumsum(length) - length
+        rows = np.repeat(own - first, length) + np.arange(length.sum())
+        inside = below(rows, 0.5 * np.log10(SQUARE[1:]))
+        inside *= (number * pair)[rows, None, None]
+        if length.max() > 1:
+            inside = np.add.reduceat(inside, first, axis=0)
+        cells = np.ascontiguousarray(np.moveaxis(cell_moments(inside, SQUARE)[..., :_POWERS], -1, 0))
+        cells = cells.reshape(_POWERS, own.size, -1)
+        for m in np.unique(node[own]):
+            low, high = np.searchsorted(node[own], [m, m + 1])
+            for k in range(_POWERS):
+                powers[k, m] += at[k, low:high].T @ cells[k, low:high]
+    shape = (magnitude.size, four_y.size, 2, SQUARE.size - 1, _POWERS)
+    unresolved = separation_moments(population)[0, :, 0]
     return PairCounts(
         cut=population.cut,
         magnitude=magnitude,
         four_y=four_y,
-        powers=powers,
+        powers=np.ascontiguousarray(np.moveaxis(powers, 0, -1)).reshape(shape),
         single=np.bincount(node, weights=number * (1 - pair), minlength=magnitude.size).astype(float),
         pairs=float(np.sum(number * pair)),
-        resolved=float(np.sum(number * pair * (1 - inside))),
+        resolved=float(np.sum(number * pair * (1 - unresolved))),
     )
 
 
 @njit(cache=True, parallel=True)
 def _count(  # type: ignore[no-untyped-def]
-    grid, log_mass_min, dark_below, index, weight, mass, q_min, q_max, exponent, given, intervals, four_y, node, edge,
-    pair, cells, powers,
-):  # fmt: skip
-    """Add the pairs of some rows to the cells; each flux ratio is shared by the nodes on either side."""
+    grid, log_mass_min, dark_below, index, weight, mass, q_min, q_max, exponent, given, intervals, four_y, at
+):
+    """Powers of 4 y of each star's companions, each flux ratio shared by the nodes on either side."""
     to_log, to_exponent = 1.0 / math.log(10.0), -0.4 * math.log(10.0)
-    for m in prange(powers.shape[0]):
-        at = np.empty((four_y.size, powers.shape[4]))
-        for s in range(mass.size):
-            if node[s] != m:
-                continue
-            at[:] = 0.0
-            i, w, log_mass = index[s], weight[s], math.log10(mass[s])
-            primary = magnitude_on_track(
-                grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
-            )
-            g, norm, last, span, nodes = mass_ratio_rule(
-                mass[s], dark_below, q_min[s], q_max[s], exponent[s], given[s], intervals
-            )
-            one, dark, h = not math.isnan(given[s]), 1.0, span / intervals
-            for k in range(nodes):
-                log_q = h * k - span + last
-                magnitude = magnitude_on_track(
-                    grid, log_mass_min, log_mass + log_q * to_log,
-                    i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],
-                )  # fmt: skip
-                f = min(math.exp(to_exponent * (magnitude - primary)), 1.0)
-                simpson = 1.0 if k == 0 or k == intervals else 4.0 if k % 2 else 2.0
-                share = 1.0 if one else math.exp(g * log_q) / norm * h / 3.0 * simpson
-                dark -= share
-                value = 4.0 * f / (1.0 + f) ** 2
-                low = min(max(np.searchsorted(four_y, value, side="right") - 1, 0), four_y.size - 2)
-                upper = (value - four_y[low]) / (four_y[low + 1] - four_y[low])
-                for j in range(at.shape[1]):
-                    at[low, j] += share * (1.0 - upper)
-                    at[low + 1, j] += share * upper
-                    share *= value
-            at[0, 0] += dark
-            for r in range(edge[s], edge[s + 1]):
-                for y in range(four_y.size):
-                    if at[y, 0] != 0.0:
-                        for half in range(2):
-                            for c in range(cells.shape[2]):
-                                for j in range(at.shape[1]):
-                                    powers[m, y, half, c, j] += pair[r] * at[y, j] * cells[r, half, c, j]
+    at[:] = 0.0
+    for s in prange(mass.size):
+        i, w, log_mass = index[s], weight[s], math.log10(mass[s])
+        primary = magnitude_on_track(
+            grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
+        )
+        g, norm, last, span, nodes = mass_ratio_rule(
+            mass[s], dark_below, q_min[s], q_max[s], exponent[s], given[s], intervals
+        )
+        one, dark, h = not math.isnan(given[s]), 1.0, span / intervals
+        for k in range(nodes):
+            log_q = h * k - span + last
+            magnitude = magnitude_on_track(
+                grid, log_mass_min, log_mass + log_q * to_log,
+                i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],
+            )  # fmt: skip
+            f = min(math.exp(to_exponent * (magnitude - primary)), 1.0)
+            simpson = 1.0 if k == 0 or k == intervals else 4.0 if k % 2 else 2.0
+            share = 1.0 if one else math.exp(g * log_q) / norm * h / 3.0 * simpson
+            dark -= share
+            value = 4.0 * f / (1.0 + f) ** 2
+            low = min(max(np.searchsorted(four_y, value, side="right") - 1, 0), four_y.size - 2)
+            upper = (value - four_y[low]) / (four_y[low + 1] - four_y[low])
+            for j in range(at.shape[0]):
+                at[j, s, low] += share * (1.0 - upper)
+                at[j, s, low + 1] += share * upper
+                share *= value
+        at[0, s, 0] += dark

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
-import math
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from porrima.criteria import SelectionConfig
 from porrima.errors import InputError
 
 __all__ = [
@@ -26,7 +26,7 @@ stars: {l: 180, b: 45, band: i, mag: [18, 19]}     # or {catalog: FILE, format: 
 multiplicity: dk13                                  # or {model: dk13, gap_rule: solar, a_max_factor: 2.5, ...}
 photometry: main-sequence                           # or habets-heintze, {model: habets-heintze, branch: primary}
 cut: 0.05                                           # arcsec
-# selection: {clip: 0.016, noise: 0.004, psf: psf0}   # or {table: FILE}: what else is rejected
+# selection: {clip: 0.016, noise: 0.004, psf: psf0}   # or {table: FILE}, {detection: euclid-vis}, {gaia: dr3}, a list
 stack_weight: equal                                 # or flux
 psf: [psf0, psf1, psf2]
 estimator: adaptive                                 # or plain, gaussian:0.75
@@ -143,34 +143,6 @@ class Photometry(_Strict):
         return dataclasses.replace(named, branch=self.branch)
 
 
-class SelectionConfig(_Strict):
-    """What else is rejected: stars of an odd shape, or by a table of the user's own; both where both are given."""
-
-    clip: float | None = Field(default=None, gt=0, le=0.2)  # largest change of a star's own shape
-    quantity: Literal["r2", "e"] = "r2"
-    noise: float | dict[float, float] | None = None  # sigma of the change, or sigma by magnitude
-    psf: str | None = None  # that stars are clipped behind, where there are several
-    table: Path | None = None
-
-    @model_validator(mode="after")
-    def _something(self) -> SelectionConfig:
-        if self.clip is None and self.table is None:
-            raise ValueError("must have clip or table")
-        if self.clip is None and self.noise is not None:
-            raise ValueError("must have clip, too, where it has noise")
-        return self
-
-    @field_validator("noise")
-    @classmethod
-    def _sigma(cls, value: Any) -> Any:
-        sigmas = value.values() if isinstance(value, dict) else [0.0 if value is None else value]
-        if not sigmas or not all(
-            0 <= s < math.inf and (s > 0 or not isinstance(value, dict)) for s in sigmas
-        ):
-            raise ValueError(f"must be a positive sigma, or one for each magnitude, got {value}")
-        return value
-
-
 class PopulationConfig(_Strict):
     """Stars, companions and what is resolved."""
 
@@ -178,7 +150,7 @@ class PopulationConfig(_Strict):
     multiplicity: Multiplicity = Multiplicity()
     photometry: Photometry = Photometry()
     cut: float = Field(default=0.05, gt=0, allow_inf_nan=False)
-    selection: SelectionConfig | None = None
+    selection: tuple[SelectionConfig, ...] | None = None  # all at work
     stack_weight: Literal["equal", "flux"] = "equal"
     seed: int = Field(default=1, ge=0, lt=2**64, strict=True)
 
@@ -186,6 +158,13 @@ class PopulationConfig(_Strict):
     @classmethod
     def _named(cls, value: Any) -> Any:
         return {"model": value} if isinstance(value, str) else value
+
+    @field_validator("selection", mode="before")
+    @classmethod
+    def _one_or_several(cls, value: Any) -> Any:
+        if isinstance(value, list) and not value:
+            raise ValueError("must hold at least one selection")
+        return (value,) if isinstance(value, dict | SelectionConfig) else value
 
 
 class RunConfig(PopulationConfig):
@@ -327,10 +306,8 @@ def load(path: Path) -> RunConfig:
     if config.stars.catalog is not None:
         stars = config.stars.model_copy(update={"catalog": path.parent / config.stars.catalog})
         config = config.model_copy(update={"stars": stars})
-    if config.selection is not None and config.selection.table is not None:
-        selection = config.selection.model_copy(
-            update={"table": (path.parent / config.selection.table).resolve()}
-        )
+    if config.selection is not None:
+        selection = tuple(one.within(path.parent) for one in config.selection)
         config = config.model_copy(update={"selection": selection})
     return config
 
@@ -405,7 +382,7 @@ def parse(model: type[Model], data: Any, source: Path | None = None) -> Model:
             e for e in errors if e["type"] == "extra_forbidden"
         ]  # tells more than the key it stood for
         error = (misspelt or errors)[0]
-        location = [str(part) for part in error["loc"]]
+        location = _place(error["loc"], data)
         key = ".".join(location) or None
         if error["type"] == "extra_forbidden":
             near = difflib.get_close_matches(location[-1], _keys(model, location[:-1]), n=1, cutoff=0.5)
@@ -440,11 +417,25 @@ def canonical(config: BaseModel) -> str:
     return json.dumps(data, sort_keys=True)
 
 
+def _place(location: tuple[int | str, ...], data: Any) -> list[str]:
+    """Keys and numbers that lead to a value, without the number of one that stands alone for a list."""
+    out = []
+    for part in location:
+        if isinstance(part, int) and not isinstance(data, list | tuple):
+            continue
+        out.append(str(part))
+        data = data.get(part) if isinstance(data, dict) else data[part] if isinstance(part, int) else None
+    return out
+
+
 def _keys(model: type[BaseModel], location: list[str]) -> list[str]:
     """Names of the keys at a place inside a model."""
     for part in location:
-        inner = model.model_fields[part].annotation if part in model.model_fields else None
-        inner = next((kind for kind in get_args(inner) if kind is not type(None)), inner)
+        if part.isdigit():  # in a list of one kind
+            continue
+        inner: Any = model.model_fields[part].annotation if part in model.model_fields else None
+        while get_args(inner):
+            inner = next(kind for kind in get_args(inner) if kind is not type(None))
         if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
             return []
         model = inner

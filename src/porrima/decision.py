@@ -26,7 +26,7 @@ from porrima.ledger import budget_answer
 from porrima.psf import GRID_PER_FWHM, psf_from_name
 from porrima.resolution import seen_by_regauss
 from porrima.response import response
-from porrima.sample import draw_stars, population_of
+from porrima.sample import draw_stars, population_of, selection_of
 from porrima.shapes import Adaptive, Plain, estimator_from_name
 
 if TYPE_CHECKING:
@@ -236,10 +236,10 @@ def decided(
         own = (survey.pixel, survey.jitter) if psf is None else (None, None)
         blur: dict[str, Any] = {"pixel": pixel or own[0], "jitter": jitter or own[1]}
         waves = chromatic(psf or survey.psf, method, colour, **blur)
-    parts = _stars_of(config, ranges)
+    parts, reply = _stars_of(config, ranges), response(profile, method)
     setting = Setting(
         requirement=requirement,
-        response=response(profile, method),
+        response=reply,
         n_stars=n_stars,
         multiplicity=config.multiplicity.build(),
         photometry=config.photometry.build(),
@@ -247,6 +247,7 @@ def decided(
         binary_fraction=binary_fraction,
         fit=fit_response(profile, sizes),
         seen=seen_by(method, sizes, profile),
+        selection=selection_of(config, reply),
     )
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -265,7 +266,7 @@ def _colours(
     """What the colour of the companions of a bin does; None where it is not asked for."""
     if waves is None:
         return dict.fromkeys(COLOUR_KEYS)
-    population = population_of(config, stars)
+    population = population_of(config, stars, setting.response)
     fraction = None if setting.binary_fraction is None else np.array([setting.binary_fraction])
     r2_0 = float(setting.response.shape0.r2)
     return colour_answer(config, population, integrate(population), waves, r2_0, fraction)

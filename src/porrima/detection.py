@@ -3,15 +3,21 @@ r"""Whether a survey sees that a star is two: the residual of its best fit by on
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter1d
+from scipy.special import ndtri
 from scipy.stats import chi2, ncx2
 
-from porrima.pointings import Pointings, dither_pattern, pointings
+from porrima import __version__
+from porrima.cache import content_key, load, save
+from porrima.pointings import HALF_WIDTH, REACH, Pointings, dither_pattern, pointings
+from porrima.selection import Layer, probability_layer
 from porrima.units import SIGMA_PER_FWHM
 
 if TYPE_CHECKING:
@@ -289,30 +295,30 @@ class Detection:
         -------
         detection : Detection
             From 0.005 arcsec to `WIDEST` and 7.5 mag.
+
+        Notes
+        -----
+        Its table takes seconds, and is kept on disk (`cache`) for the pixels of the PSF and all that is given.
         """
         grid = np.arange(magnitudes[0], magnitudes[1] + 1, dtype=float)
-        separation, contrast = np.meshgrid(10**_LOG_SEPARATION, _CONTRAST, indexing="ij")
-        r, f = (np.tile(v.ravel(), ANGLES) for v in (separation, 10 ** (-0.4 * contrast)))
-        angle = np.repeat(2 * math.pi * np.arange(ANGLES) / ANGLES, contrast.size)
         r2_error = psf_error * 2 * (psf.fwhm * SIGMA_PER_FWHM) ** 2
-        found, star = [], pointings(psf, exposures.pixel, dither_pattern(exposures.n_exposures), roll)
-        for phase in range(PHASES):
-            star = replace(star, place=dither_pattern(exposures.n_exposures, phase))
-            turned = angle + 2 * math.pi * phase / PHASES / ANGLES
-            found.append(misfit(star, exposures, r, f, turned, grid, statistic, r2_error))
-        sorted_ = np.sort(np.reshape(found, (PHASES * ANGLES, -1)), axis=0)
-        classes = sorted_.reshape(GROUPS, -1, *separation.shape, grid.size).mean(axis=1)
-        trend = _trend(exposures, separation[..., None], 10 ** (-0.4 * contrast[..., None]), grid)
-        table = np.log(np.maximum(classes / trend, 1e-300))
-        for axis in (1, 2, 3):
-            table = spline_filter1d(table, order=3, axis=axis, mode="mirror")
+        turns = np.zeros(exposures.n_exposures) if roll is None else np.asarray(roll, dtype=float)
+        image = psf.draw(reach=HALF_WIDTH + REACH)
+        key = content_key(
+            image.array, image.scale, exposures, r2_error, statistic, turns, grid, _code_version()
+        )
+        known = load(key)
+        if known is None:
+            known = {"table": _table(psf, exposures, turns, grid, statistic, r2_error)}
+            save(key, known)
+        pixels = exposures.n_exposures * (2 * math.ceil(HALF_WIDTH / exposures.pixel) + 1) ** 2
         return cls(
             name=f"{exposures.name}, {exposures.n_exposures} exposures, {psf.name}",
             exposures=exposures,
             false_alarm=false_alarm,
-            degrees=SHAPE_DEGREES if statistic == "shape" else star.n_pixels - SHAPE_DEGREES,
+            degrees=SHAPE_DEGREES if statistic == "shape" else pixels - SHAPE_DEGREES,
             magnitudes=grid,
-            table=table,
+            table=known["table"],
         )
 
     def misfits(self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray) -> FloatArray:
@@ -364,6 +370,25 @@ class Detection:
         found = self.misfits(separation, flux_ratio, magnitude)
         return np.asarray(detection_probability(found, self.false_alarm, self.degrees).mean(axis=0))
 
+    def layers(
+        self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray
+    ) -> tuple[Layer, ...]:
+        r"""The probability on a grid.
+
+        Parameters
+        ----------
+        separation, flux_ratio, magnitude : (n_r,), (n_f,), (n_m,) float array
+            In arcsec, dimensionless and mag.
+
+        Returns
+        -------
+        layers : tuple of Layer
+            One, as normal deviates: nearly linear in :math:`\sqrt{\Delta\chi^2}`, which goes with
+            :math:`f/(1+f)^2` and the square of the separation.
+        """
+        found = probability_layer(self, separation, flux_ratio, magnitude).score
+        return (Layer(score=ndtri(np.clip(found, 1e-300, 1 - 1e-16)), normal=True),)
+
 
 def _trend(
     exposures: Exposures, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray
@@ -373,3 +398,36 @@ def _trend(
     square = separation**2 / (1 + (separation / _CORE) ** 2)
     flux = exposures.electrons(magnitude)
     return np.asarray((y * square * flux) ** 2 / (exposures.background + _PEAK * flux))
+
+
+def _table(
+    psf: PSF,
+    exposures: Exposures,
+    roll: FloatArray,
+    magnitudes: FloatArray,
+    statistic: Statistic,
+    r2_error: float,
+) -> FloatArray:
+    """Coefficients of the splines of `Detection`."""
+    separation, contrast = np.meshgrid(10**_LOG_SEPARATION, _CONTRAST, indexing="ij")
+    r, f = (np.tile(v.ravel(), ANGLES) for v in (separation, 10 ** (-0.4 * contrast)))
+    angle = np.repeat(2 * math.pi * np.arange(ANGLES) / ANGLES, contrast.size)
+    found, star = [], pointings(psf, exposures.pixel, dither_pattern(exposures.n_exposures), roll)
+    for phase in range(PHASES):
+        star = replace(star, place=dither_pattern(exposures.n_exposures, phase))
+        turned = angle + 2 * math.pi * phase / PHASES / ANGLES
+        found.append(misfit(star, exposures, r, f, turned, magnitudes, statistic, r2_error))
+    sorted_ = np.sort(np.reshape(found, (PHASES * ANGLES, -1)), axis=0)
+    classes = sorted_.reshape(GROUPS, -1, *separation.shape, magnitudes.size).mean(axis=1)
+    trend = _trend(exposures, separation[..., None], 10 ** (-0.4 * contrast[..., None]), magnitudes)
+    table = np.log(np.maximum(classes / trend, 1e-300))
+    for axis in (1, 2, 3):
+        table = spline_filter1d(table, order=3, axis=axis, mode="mirror")
+    return np.asarray(table)
+
+
+@cache
+def _code_version() -> str:
+    """Hash of the modules that a table is made with."""
+    modules = sys.modules[Pointings.__module__], sys.modules[__name__]
+    return content_key(__version__, *(Path(str(m.__file__)).read_bytes() for m in modules))

@@ -11,6 +11,8 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.special import erf, ndtr
 
+from porrima.selection import SHARP, Layer
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -181,18 +183,56 @@ class GaiaFlags:
         r, f, g = np.broadcast_arrays(
             separation, flux_ratio, np.asarray(magnitude, dtype=float) - self.colour
         )
-        share, rms = _scan_table()
-        contrast = np.clip(-2.5 * np.log10(np.maximum(f, 1e-12)), 0.0, _CONTRAST[-1])
-        place = np.stack([np.clip(r, 0.0, _SEPARATION[-1]), contrast], axis=-1)
-        error, pair = along_scan_error(g), f > 10 ** (-0.4 * _CONTRAST[-1])
+        quiet = self._excess(r, f, g) <= self.ruwe_max**2 - 1
+        return np.asarray(1 - self._one_peak(r, f, g) * quiet)
+
+    def layers(
+        self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray
+    ) -> tuple[Layer, ...]:
+        """Both flags on a grid.
+
+        Parameters
+        ----------
+        separation, flux_ratio, magnitude : (n_r,), (n_f,), (n_m,) float array
+            In arcsec, dimensionless and mag.
+
+        Returns
+        -------
+        layers : tuple of Layer
+            Double peaks, as a probability, and ``ruwe``, as a sharp edge; dimensionless.  Between nodes, 12 % apart
+            in the square of the separation, what is kept is known to a few per cent.
+        """
+        g, f, r = np.meshgrid(magnitude - self.colour, flux_ratio, separation, indexing="ij")
+        edge = (self._excess(r, f, g) / (self.ruwe_max**2 - 1) - 1) / SHARP
+        return (
+            Layer(score=1 - self._one_peak(r, f, g), normal=False),
+            Layer(score=edge, normal=True),
+        )
+
+    def _one_peak(self, r: FloatArray, f: FloatArray, g: FloatArray) -> FloatArray:
+        """Probability that no double peak is reported, and no false one."""
         kept = np.full(r.shape, 1.0 - self.false_alarm)
-        if self.multi_peak:
-            seen = ndtr(f / (1 + f) * SAMPLE / error - PEAK_SIGNIFICANCE)
-            kept = kept * np.where(
-                pair, (1 - np.clip(share(place).reshape(r.shape), 0, 1)) ** SCANS * seen + 1 - seen, 1.0
-            )
-        ruwe2 = 1 + np.where(pair, (rms(place).reshape(r.shape) / error) ** 2, 0.0)
-        return np.asarray(1 - kept * (ruwe2 <= self.ruwe_max**2))
+        if not self.multi_peak:
+            return kept
+        share = np.clip(_scan_table()[0](_place(r, f)).reshape(r.shape), 0, 1)
+        seen = ndtr(f / (1 + f) * SAMPLE / along_scan_error(g) - PEAK_SIGNIFICANCE)
+        return np.asarray(kept * np.where(_is_pair(f), (1 - share) ** SCANS * seen + 1 - seen, 1.0))
+
+    def _excess(self, r: FloatArray, f: FloatArray, g: FloatArray) -> FloatArray:
+        """RUWE² - 1, where the place of a blend depends on the scan."""
+        rms = _scan_table()[1](_place(r, f)).reshape(r.shape)
+        return np.where(_is_pair(f), (rms / along_scan_error(g)) ** 2, 0.0)
+
+
+def _is_pair(flux_ratio: FloatArray) -> NDArray[np.bool_]:
+    """Whether the companion is bright enough for the table."""
+    return np.asarray(flux_ratio > 10 ** (-0.4 * _CONTRAST[-1]))
+
+
+def _place(separation: FloatArray, flux_ratio: FloatArray) -> FloatArray:
+    """Separation in arcsec and contrast in mag within the table, (n, 2)."""
+    contrast = np.clip(-2.5 * np.log10(np.maximum(flux_ratio, 1e-12)), 0.0, _CONTRAST[-1])
+    return np.stack([np.clip(separation, 0.0, _SEPARATION[-1]), contrast], axis=-1)
 
 
 def orbital_excess(period: FloatArray) -> FloatArray:

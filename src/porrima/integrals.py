@@ -188,7 +188,7 @@ def coefficient_polynomial(n: int, m: int = 0) -> FloatArray:
     return out
 
 
-def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegrals:
+def integrate(population: Population, intervals: int = _INTERVALS, is_rough: bool = False) -> PairIntegrals:
     r"""Expectations over companions by quadrature: mass ratio by Simpson's rule, orientation by Gauss's.
 
     Parameters
@@ -197,6 +197,8 @@ def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegr
         Stars, their companions' law, the cut and the selection.
     intervals : int
         Of Simpson's rule, a multiple of four (count).
+    is_rough : bool
+        Whether every other node of a selection will do: then both rules have these, and no error of it is known.
 
     Returns
     -------
@@ -212,15 +214,15 @@ def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegr
     screen = screen_of(population)
     joint = None
     if not screen.is_empty:
-        joint = np.stack(
-            [
-                joint_powers(
-                    population, screen, rule, intervals // (1 + rule), starts_of_mass_ratios(population.law),
-                    separations_below(population, rule),
-                )
-                for rule in (0, 1)
-            ]
-        )  # fmt: skip
+        start, rules = starts_of_mass_ratios(population.law), (1,) if is_rough else (0, 1)
+        found = [
+            joint_powers(
+                population, screen, rule, intervals // (1 if is_rough else 1 + rule), start,
+                separations_below(population, rule),
+            )
+            for rule in rules
+        ]  # fmt: skip
+        joint = np.stack([found[0], found[-1]])
     return PairIntegrals(
         cut=population.cut,
         coefficient=coefficient_moments(population, intervals),
@@ -230,7 +232,9 @@ def integrate(population: Population, intervals: int = _INTERVALS) -> PairIntegr
     )
 
 
-def separations_below(population: Population, rule: int) -> Callable[[IntArray, FloatArray], FloatArray]:
+def separations_below(
+    population: Population, rule: int, order: int = ORDER
+) -> Callable[[IntArray, FloatArray], FloatArray]:
     """Partial moments of the separation of some rows below some fractions of the cut.
 
     Parameters
@@ -239,11 +243,13 @@ def separations_below(population: Population, rule: int) -> Callable[[IntArray, 
         Of n rows.
     rule : {0, 1}
         The rule in use or the coarser one.
+    order : int
+        Of the highest even moment that is wanted, halved, 0 to 8 (count).
 
     Returns
     -------
     moments : callable
-        From the numbers (m,) of rows and fractions (k,) in dex to logarithms (m, k, 9) of the even moments of the
+        From the numbers (m,) of rows and fractions (k,) in dex to the even moments (m, k, order + 1) of the
         separation below each fraction, over it (dimensionless).
     """
     law = population.law
@@ -251,14 +257,14 @@ def separations_below(population: Population, rule: int) -> Callable[[IntArray, 
     scatter, beyond = law.log_a_sigma.round(12), (law.log_a_max - law.log_a).round(12)
 
     def found(some: IntArray, fraction: FloatArray) -> FloatArray:
-        out = np.empty((some.size, fraction.size, ORDER + 1))
+        out = np.empty((some.size, fraction.size, order + 1))
         kinds, which = np.unique(np.stack([scatter[some], beyond[some]], axis=1), axis=0, return_inverse=True)
         for number, (sigma, widest) in enumerate(kinds):
             mine = which.ravel() == number
             at = (place[some[mine], None] + fraction).ravel()
-            log_moments = _log_moments(float(sigma), float(widest), population.projection, at, rule)
-            out[mine] = log_moments.reshape(-1, fraction.size, ORDER + 1)
-        return out
+            log_moments = _log_moments(float(sigma), float(widest), population.projection, at, rule, order)
+            out[mine] = log_moments.reshape(-1, fraction.size, order + 1)
+        return np.asarray(np.exp(out, out=out))
 
     return found
 
@@ -392,24 +398,24 @@ def separation_moments(population: Population) -> FloatArray:
 
 
 def _log_moments(
-    sigma: float, beyond: float, projection: Projection, place: FloatArray, rule: int
+    sigma: float, beyond: float, projection: Projection, place: FloatArray, rule: int, order: int = ORDER
 ) -> FloatArray:
-    """Logarithms of the partial moments (n, 9) where the cut times distance over mean axis is (n,), in dex."""
+    """Logarithms of the partial moments (n, order + 1) where cut times distance over mean axis is (n,), in dex."""
     lowest = math.floor(min(place.min(), beyond - _STEP))
     inside = np.minimum(place, beyond)
     if math.isinf(beyond):
         highest, across = float(math.ceil(place.max()) + 1), inside
     else:
         highest, across = beyond, np.sqrt(beyond - inside)
-    table = _separation_table(sigma, beyond, projection, lowest, highest, rule)
+    table = _separation_table(sigma, beyond, projection, lowest, highest, rule, order)
     farther = (place - inside)[:, None] * math.log(10)  # where the cut is beyond the widest orbit
-    log_moments: FloatArray = table(across) - 2 * np.arange(ORDER + 1) * farther
+    log_moments: FloatArray = table(across) - 2 * np.arange(order + 1) * farther
     return log_moments
 
 
 @lru_cache(maxsize=256)
 def _separation_table(
-    sigma: float, beyond: float, projection: Projection, lowest: float, highest: float, rule: int
+    sigma: float, beyond: float, projection: Projection, lowest: float, highest: float, rule: int, order: int
 ) -> CubicSpline:
     """Logarithms of the partial moments against log10 of cut times distance over the mean semi-major axis.
 
@@ -427,8 +433,8 @@ def _separation_table(
         rho, weight = projection_nodes(projection, kink, nodes=32 // (1 + rule))
     reach = place[:, None] * math.log(10) - np.log(rho)  # of ln(a / mean a) at the cut
     z = np.minimum(reach, largest) / s
-    log_moments = np.empty((place.size, ORDER + 1))
-    for k in range(ORDER + 1):
+    log_moments = np.empty((place.size, order + 1))
+    for k in range(order + 1):
         log_partial = -2 * k * reach + 0.5 * (2 * k * s) ** 2 + log_ndtr(z - 2 * k * s)
         log_moments[:, k] = logsumexp(log_partial, axis=1, b=np.maximum(weight, _LEAST))
     return CubicSpline(node, log_moments - log_ndtr(largest / s))

@@ -60,7 +60,7 @@ def joint_powers(
     rule: int,
     intervals: int,
     start: IntArray,
-    log_moments: Callable[[IntArray, FloatArray], FloatArray],
+    moments: Callable[[IntArray, FloatArray], FloatArray],
 ) -> FloatArray:
     r"""Expectation of powers of 4 y and of the separation over the pairs that are kept.
 
@@ -76,9 +76,9 @@ def joint_powers(
         Of Simpson's rule over the logarithm of the mass ratio, even (count).
     start : (k,) int array
         First row of each run of classes that share star and mass ratios, ascending from 0 (dimensionless).
-    log_moments : callable
-        Logarithms (m, n_r, 9) of the even moments of the separation below some (n_r,) fractions of the cut, over
-        these, for some stars (dimensionless).
+    moments : callable
+        Even moments (m, n_r, 9) of the separation below some (n_r,) fractions of the cut, over these, for some stars
+        (dimensionless).
 
     Returns
     -------
@@ -96,7 +96,7 @@ def joint_powers(
     for part in np.array_split(np.arange(start.size), max(1, law.star.size // _ROWS)):
         own = start[part]
         rows = np.arange(own[0], edges[part[-1] + 1])
-        cells = cell_moments(log_moments(rows, 0.5 * np.log10(square[1:])), square)
+        cells = cell_moments(moments(rows, 0.5 * np.log10(square[1:])), square)
         _joint(
             tracks.magnitude, tracks.log_mass_min, tracks.dark_below, tracks.index[own], tracks.weight[own],
             population.stars.mass[own], law.mass_ratio_min[own], law.mass_ratio_max[own],
@@ -107,23 +107,23 @@ def joint_powers(
     return out
 
 
-def cell_moments(log_moments: FloatArray, square: FloatArray) -> FloatArray:
+def cell_moments(moments: FloatArray, square: FloatArray) -> FloatArray:
     r"""Moments of v between its nodes, and how they lean.
 
     Parameters
     ----------
-    log_moments : (n, n_r - 1, 9) float array
-        Logarithms of the even moments of the separation below each node but 0, over that node.
+    moments : (n, n_r - 1, n_k) float array
+        Even moments of the separation below each node but 0, over that node (dimensionless).
     square : (n_r,) float array
         Nodes of v, the first 0, dimensionless.
 
     Returns
     -------
-    moments : (n, 2, n_r - 1, 9) float array
+    cells : (n, 2, n_r - 1, n_k) float array
         In each interval :math:`E[v^k]` and :math:`12 E[v^k (s - 1/2)]`, with s from 0 to 1 in proportion to v;
         dimensionless.
     """
-    below = np.exp(log_moments) * square[1:, None] ** np.arange(ORDER + 1)
+    below = moments * square[1:, None] ** np.arange(moments.shape[2])
     content = np.diff(below, axis=1, prepend=0.0)
     lean = np.empty_like(content)
     step = np.diff(square)[:, None]

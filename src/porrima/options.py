@@ -12,7 +12,7 @@ from porrima.errors import InputError
 __all__ = [
     "Band", "BinaryFraction", "Catalogue", "Colour", "EstimatorName", "Format", "GalaxySize", "GalaxySizes",
     "Instrument", "Jitter", "Json", "Latitude", "Longitude", "Mag", "Mapping", "MultiplicityName", "Output",
-    "PhotometryName", "Pixel", "PixelScale", "Plot", "Psf", "ReaderOptions", "Seed", "StarsTable",
+    "PhotometryName", "Pixel", "PixelScale", "Plot", "Psf", "ReaderOptions", "Rejected", "Seed", "StarsTable",
     "SurveyCut", "SurveyPsf", "table_of",
 ]  # fmt: skip
 
@@ -40,6 +40,13 @@ PhotometryName = Annotated[
     ),
 ]
 Psf = Annotated[str, typer.Option("--psf", help="Name of the PSF.")]
+Rejected = Annotated[
+    str | None,
+    typer.Option(
+        "--selection",
+        help="Also rejected: a table, {clip: T, noise: SIGMA}, {detection: euclid-vis}, {gaia: dr3}, a list.",
+    ),
+]
 Pixel = Annotated[float | None, typer.Option("--pixel", help="Side of a pixel to convolve with [arcsec].")]
 PixelScale = Annotated[float | None, typer.Option("--pixel-scale", help="Of a FITS image [arcsec].")]
 Jitter = Annotated[

@@ -18,7 +18,7 @@ from porrima.errors import InputError
 from porrima.extrapolation import best_split, extrapolate, sample_covariance
 from porrima.patches import one_patch, read_patches
 from porrima.prediction import QUANTITIES, SeriesWarning, predict
-from porrima.sample import catalog_of, draw_stars
+from porrima.sample import catalog_of, draw_stars, selection_of
 from porrima.samples import Fractions, samples_of
 from porrima.shapes import estimator_from_name
 from porrima.uncertainty import uncertainty
@@ -196,6 +196,8 @@ def corrected(
     """
     if method not in METHODS:
         raise InputError(f"must be one of {', '.join(METHODS)}", key="--method", value=method)
+    if method != "predict" and options.get("selection") is not None:
+        raise InputError("goes with --method predict alone", key="--selection", value=options["selection"])
     for key, value in (("--shape", shape), ("--shape-error", shape_error), ("--n-stars", n_stars)):
         if table is not None and value is not None:
             raise InputError("cannot be given together with a table of patches", key=key)
@@ -278,6 +280,7 @@ def _by_prediction(scene: _Scene) -> dict[str, Any]:
     """Each patch by the prediction for its own stars."""
     if scene.stars is None:
         raise InputError("is missing", key="stars")
+    models = scene.models | {"selection": selection_of(scene.stars.config, scene.reply)}
     out: dict[str, Any] = {name: [] for name in ("values", "shear", "populations", "sources")}
     known: dict[tuple[Any, ...], tuple[int, Uncertainty]] = {}
     changes: dict[tuple[Any, ...], tuple[Change, Prediction]] = {}
@@ -289,7 +292,7 @@ def _by_prediction(scene: _Scene) -> dict[str, Any]:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", SeriesWarning)  # said below
                 found = uncertainty(
-                    stars, scene.reply, binary_fraction=fraction, n_stars=patch.n_stars, **scene.models
+                    stars, scene.reply, binary_fraction=fraction, n_stars=patch.n_stars, **models
                 )
             known[place] = len(known) + 1, found
             _add_population(out, *known[place], len(stars), place)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from porrima.config import RunConfig
 from porrima.errors import InputError
+from porrima.instruments import SURVEYS
 from porrima.selection import Combined, read_selection
 from porrima.systems import BRIGHT_MASS, Population
 
 if TYPE_CHECKING:
     from porrima.catalogs import Catalog
     from porrima.config import PopulationConfig
+    from porrima.criteria import SelectionConfig
+    from porrima.detection import Detection
     from porrima.response import Response
     from porrima.selection import Selection
     from porrima.stars import Stars
@@ -146,36 +151,63 @@ def selection_of(config: PopulationConfig, response: Response | None = None) -> 
     InputError
         If the table is wrong, or it is not clear which PSF is meant.
     """
-    wanted = config.selection
-    if wanted is None:
+    if config.selection is None:
         return None
-    parts: list[Selection] = []
-    if wanted.clip is not None:
-        from porrima.clip import Clip, Noise  # noqa: PLC0415  (the response, where used)
+    parts = tuple(_built(one, config, response) for one in config.selection)
+    return parts[0] if len(parts) == 1 else Combined(parts=parts)
 
-        noise = wanted.noise or 0.0
-        magnitudes = sorted(noise) if isinstance(noise, dict) else [0.0]
-        sigma = [noise[m] for m in magnitudes] if isinstance(noise, dict) else [noise]
-        parts.append(
-            Clip(
-                response=_clipped_behind(config, response),
-                threshold=wanted.clip,
-                quantity=wanted.quantity,
-                noise=Noise(magnitude=tuple(magnitudes), sigma=tuple(sigma)),
-            )
+
+def _built(one: SelectionConfig, config: PopulationConfig, response: Response | None) -> Selection:
+    """One selection of a configuration."""
+    if one.table is not None:
+        return read_selection(one.table)
+    if one.gaia is not None:
+        from porrima.gaia_flags import GaiaFlags  # noqa: PLC0415  (where used)
+
+        return GaiaFlags(**one.given("ruwe_max", "multi_peak", "false_alarm", "colour"))
+    if one.detection is not None:
+        return _detection(
+            one.detection,
+            one.psf,
+            one.pixel,
+            one.exposures,
+            **one.given("false_alarm", "statistic", "psf_error"),
         )
-    if wanted.table is not None:
-        parts.append(read_selection(wanted.table))
-    return parts[0] if len(parts) == 1 else Combined(parts=tuple(parts))
+    from porrima.clip import Clip, Noise  # noqa: PLC0415  (the response, where used)
+
+    noise = one.noise or 0.0
+    by_magnitude = sorted(noise.items()) if isinstance(noise, dict) else [(0.0, noise)]
+    magnitude, sigma = zip(*by_magnitude, strict=True)
+    return Clip(
+        response=_clipped_behind(one.psf, config, response),
+        threshold=one.clip or 0.0,
+        quantity=one.quantity or "r2",
+        noise=Noise(magnitude=magnitude, sigma=sigma),
+    )
 
 
-def _clipped_behind(config: PopulationConfig, given: Response | None) -> Response:
+@lru_cache(maxsize=16)
+def _detection(
+    survey: str, psf: str | None, pixel: float | None, n_exposures: int | None, **options: Any
+) -> Detection:
+    """What a survey recognises on its exposures, behind its own PSF or another."""
+    from porrima.detection import Detection  # noqa: PLC0415  (compiled code, where used)
+    from porrima.exposure import EXPOSURES  # noqa: PLC0415
+    from porrima.psf import psf_from_name  # noqa: PLC0415  (GalSim, where used)
+
+    own, exposures = SURVEYS[survey], EXPOSURES[survey]()
+    if n_exposures is not None:
+        exposures = replace(exposures, n_exposures=n_exposures)
+    name, side, jitter = (psf, pixel, None) if psf is not None else (own.psf, own.pixel, own.jitter)
+    return Detection.of(psf_from_name(name, pixel=side, jitter=jitter), exposures, **options)
+
+
+def _clipped_behind(name: str | None, config: PopulationConfig, given: Response | None) -> Response:
     """Response of the PSF that stars are clipped behind."""
     from porrima.psf import psf_from_name  # noqa: PLC0415  (GalSim, where used)
     from porrima.response import response  # noqa: PLC0415
     from porrima.shapes import estimator_from_name  # noqa: PLC0415
 
-    name = config.selection.psf if config.selection is not None else None
     if given is not None:
         if name is not None:
             raise InputError("is that of the command", key="selection.psf", value=name)

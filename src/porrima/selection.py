@@ -387,7 +387,10 @@ def _gridded(
         line[at] = probability[k]
     gaps = np.argwhere(np.isnan(grid))
     if gaps.size:
-        where = ", ".join(f"{name} {nodes[name][i]:g}" for name, i in zip(_AXES, gaps[0], strict=True))
+        named = [
+            (name, i) for name, i in zip(_AXES, gaps[0], strict=True) if name != "magnitude" or alone.size > 1
+        ]
+        where = ", ".join(f"{name} {nodes[name][i]:g}" for name, i in named)
         raise InputError("must have a row for each combination", source=path, value=f"none for {where}")
     if np.isnan(alone).any() and not np.isnan(alone).all():
         where = f"none for magnitude {nodes['magnitude'][int(np.argmax(np.isnan(alone)))]:g}"

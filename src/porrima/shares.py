@@ -110,7 +110,7 @@ class MagnitudeBin:
         One for each quantity of each group.
     widest_cut : dict
         Widest cut with which all quantities of a group meet their requirements, in arcsec, sought up to twice the
-        given one or to where the series in kernel moments ends; NaN where there is none.
+        given one or to where the series in kernel moments ends; NaN where there is none, and with a selection.
     """
 
     magnitude: tuple[float, float]

@@ -186,12 +186,14 @@ class _Run:
     @property
     def identity(self) -> str:
         """Hash of all that the numbers depend on."""
-        rest, table = self.config.model_copy(update={"stars": None}), None  # wherever the stars came from
-        if rest.selection is not None and rest.selection.table is not None:
-            table = rest.selection.table.read_bytes()
-            rest = rest.model_copy(update={"selection": rest.selection.model_copy(update={"table": None})})
+        rest, tables = self.config.model_copy(update={"stars": None}), []  # wherever the stars came from
+        if rest.selection is not None:
+            tables = [one.table.read_bytes() for one in rest.selection if one.table is not None]
+            bare = tuple(one.model_copy(update={"table": None}) for one in rest.selection)
+            rest = rest.model_copy(update={"selection": bare})
         digest = hashlib.sha256(f"{canonical(rest)} {self.method} {self.device} {__version__}".encode())
-        digest.update(table or b"")
+        for table in tables:
+            digest.update(table)
         stars = self.population.primaries
         digest.update(stars.band.encode())
         for shape in self.alone.T:  # a file of a PSF's name may have changed

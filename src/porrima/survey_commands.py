@@ -30,6 +30,7 @@ from porrima.options import (
     PixelScale,
     Plot,
     ReaderOptions,
+    Rejected,
     Seed,
     StarsTable,
     SurveyCut,
@@ -68,6 +69,7 @@ def budget(
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
     cut: SurveyCut = None,
+    selection: Rejected = None,
     colour: Colour = None,
     seed: Seed = 1,
     plot: Plot = None,
@@ -84,6 +86,7 @@ def budget(
         bins=bins, step=step, psf=psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter, estimator=estimator,
         n_stars=n_stars, binary_fraction=binary_fraction, cut=cut, l=l, b=b, catalog=catalog, format=format, map=map,
         options=options, band=band, colour=colour, seed=seed, multiplicity=multiplicity, photometry=photometry,
+        selection=selection,
     )  # fmt: skip
     write_budget(result, output, plot)
     show(result, as_json, header_of(result, multiplicity), BUDGET_COLUMNS, budget_lines(found))
@@ -139,6 +142,7 @@ def correct(
     photometry: PhotometryName = "main-sequence",
     band: Band = None,
     cut: SurveyCut = None,
+    selection: Rejected = None,
     seed: Seed = 1,
     plot: Plot = None,
     output: Output = None,
@@ -154,7 +158,7 @@ def correct(
         instrument=instrument, galaxy_size=galaxy_size, galaxies=galaxies, mag=mag, psf=psf, pixel=pixel,
         pixel_scale=pixel_scale, jitter=jitter, estimator=estimator, binary_fraction=binary_fraction, cut=cut, l=l, b=b,
         catalog=catalog, format=format, map=map, options=options, band=band, seed=seed, multiplicity=multiplicity,
-        photometry=photometry,
+        photometry=photometry, selection=selection,
     )  # fmt: skip
     write_correction(result, output, plot)
     show(result, as_json, correct_header(result), CORRECT_COLUMNS, correct_lines(result))

@@ -374,7 +374,7 @@ def _moved(
 def _rough(population: Population) -> PairIntegrals:
     """Integrals good enough for changes."""
     if population.selection is not None:
-        return integrate(population, _INTERVALS)
+        return integrate(population, _INTERVALS, is_rough=True)
     return PairIntegrals(
         cut=population.cut,
         coefficient=coefficient_moments(population, _INTERVALS),
