@@ -84,7 +84,7 @@ def document_where_it_is_made(app, what, name, obj, skip, options):
 
 
 def write_pages(app):
-    """Pages made of files that stand elsewhere, written where they have changed: references, and what is beside the README."""
+    """Pages made of files that stand elsewhere: the references, and what is beside the README."""
     folder = HERE / "generated"
     folder.mkdir(exist_ok=True)
     parts = ["# References\n\nAs BibTeX: {download}`references.bib <../references.bib>`.\n"]
