@@ -11,6 +11,9 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "src"))
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # compiled functions then have signatures and docstrings like others
 
+from docutils.nodes import SkipNode  # noqa: E402
+from latex2mathml.converter import convert as mathml  # noqa: E402
+
 import porrima  # noqa: E402
 from porrima.bibliography import bibliography  # noqa: E402
 
@@ -38,7 +41,7 @@ extensions = [
     "sphinx.ext.viewcode",
 ]
 templates_path = ["templates"]
-exclude_patterns = ["templates"]
+exclude_patterns = ["static", "templates"]
 suppress_warnings = ["toc.not_readable"]  # a page of the index that is not there is passed over
 
 myst_enable_extensions = ["amsmath", "dollarmath"]
@@ -47,6 +50,7 @@ myst_dmath_double_inline = True
 
 nb_execution_mode = "cache"  # a tutorial runs again when its cells change
 nb_execution_in_temp = True
+nb_merge_streams = True
 nb_execution_cache_path = str(HERE.parent / "build" / "tutorials")
 nb_execution_timeout = 120
 nb_execution_raise_on_error = True
@@ -61,11 +65,18 @@ napoleon_use_rtype = False
 html_theme = "furo"
 html_title = f"Porrima {release}"
 html_copy_source = False
+html_show_copyright = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_theme_options = {"light_css_variables": {"code-font-size": "0.76em"}}
+html_math_renderer = "mathml"
 pygments_style, pygments_dark_style = "friendly", "monokai"
 
 
-def link_references(app, what, name, obj, options, lines):
-    """Keys under "References" lead to the page of references."""
+def prepare_docstring(app, what, name, obj, options, lines):
+    """Keys under "References" lead to the page of references; a colon in the line of a constant is no type."""
+    if what in ("attribute", "data", "property"):
+        lines[0] = lines[0].replace(": ", " – ")  # napoleon takes what stands before a colon for a type
     if "References" in lines:
         first = lines.index("References")
         for k in range(first, len(lines)):
@@ -103,8 +114,21 @@ def write_pages(app):
             page.write_text(text, encoding="utf-8")
 
 
+def inline_equation(writer, node):
+    """An equation within a line, as MathML: no script and no network is needed to read it."""
+    writer.body.append(mathml(node.astext()))
+    raise SkipNode
+
+
+def displayed_equation(writer, node):
+    """An equation on its own."""
+    writer.body.append(f'<div class="math">{mathml(node.astext(), display="block")}</div>')
+    raise SkipNode
+
+
 def setup(app):
     """Connect the hooks."""
-    app.connect("autodoc-process-docstring", link_references, priority=100)
+    app.add_html_math_renderer("mathml", (inline_equation, None), (displayed_equation, None))
+    app.connect("autodoc-process-docstring", prepare_docstring, priority=100)
     app.connect("autodoc-skip-member", document_where_it_is_made)
     app.connect("builder-inited", write_pages, priority=100)
