@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: test lint validation paper clean
+.PHONY: test lint validation docs paper clean
 
 .venv: .venv/installed
 
@@ -22,8 +22,13 @@ test: lint
 validation: .venv/installed
 	$(BIN)/python -m pytest tests/validation --write-validation
 
+docs: .venv/installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[all,dev,docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q docs build/docs
+	@echo site: build/docs/index.html
+
 paper: .venv/installed
 	$(BIN)/porrima paper --output paper
 
 clean:
-	rm -rf .venv paper build dist src/porrima/__pycache__ .numba_cache
+	rm -rf .venv paper build dist docs/generated src/porrima/__pycache__ .numba_cache

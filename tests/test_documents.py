@@ -1,6 +1,8 @@
 """The documents tell the truth: what they show runs, what they name exists, what exists they name."""
 
 import ast
+import contextlib
+import io
 import json
 import re
 import shlex
@@ -8,6 +10,7 @@ import sys
 from itertools import chain
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import typer
@@ -36,9 +39,11 @@ from porrima.psf import PSFS
 from porrima.shapes import ESTIMATORS
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md")), *TUTORIALS]
 README, COMMANDS, MODELS = ROOT / "README.md", ROOT / "docs" / "commands.md", ROOT / "docs" / "models.md"
 BENCH = ROOT / "docs" / "bench.json"
+INDEX, API = ROOT / "docs" / "index.md", ROOT / "docs" / "api.md"
 OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]*")
 KEY = re.compile(r"\b[A-Z][A-Za-z]*\d{2,4}[a-z]?\b")  # KCM16, Robin2003
 GROUP = typer.main.get_command(app)
@@ -55,6 +60,30 @@ def command_lines():
             for line in block.splitlines():
                 if line.startswith("porrima "):
                     yield pytest.param(line, id=f"{path.name}: {line}")
+
+
+def cells(path):
+    """Code of a document in its order: what is Python, and whether it is; of the rest, lines of commands."""
+    text = path.read_text(encoding="utf-8")
+    for kind, body in re.findall(r"^```(\{code-cell\} ipython3|python|sh)\n(.*?)^```", text, re.M | re.S):
+        if kind == "sh":
+            yield False, [line for line in body.splitlines() if line.startswith("porrima ")]
+        elif body.startswith("!"):
+            yield False, [line[1:] for line in body.splitlines()]
+        else:
+            yield True, body
+
+
+def carried_out(line):
+    """What a command prints on standard output, which a last part ``> FILE`` catches."""
+    words, _, file = line.partition(" > ")
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as out:
+        patch.setattr(sys, "argv", shlex.split(words))
+        with pytest.raises(SystemExit) as end:
+            main()
+    assert end.value.code == 0, line
+    if file:
+        Path(file).write_text(out.getvalue(), encoding="utf-8")
 
 
 def section(command):
@@ -113,6 +142,44 @@ def test_every_command_line_shown_is_one_that_porrima_takes(line):
     words = shlex.split(line.split(" > ")[0])[1:]
     command = GROUP.commands[words[0]]
     command.make_context(words[0], words[1:])
+
+
+def test_the_commands_of_the_readme_run_one_after_the_other(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("pairs.csv").write_text("flux_ratio,dx,dy\n0,0,0\n0.5,0.03,0.01\n")
+    Path("patches.csv").write_text("r2,n_stars,mag_lo,mag_hi\n9.67e-3,2000,18,19\n")
+    lines = [line for is_python, block in cells(README) if not is_python for line in block]
+    for line in lines:
+        if not line.startswith("porrima paper"):  # a minute; its experiments have tests of their own
+            carried_out(line)
+    assert len(lines) > 10
+
+
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda p: p.stem)
+def test_every_cell_and_command_of_a_tutorial_runs(path, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    plt.switch_backend("agg")
+    names = {}
+    for number, (is_python, block) in enumerate(cells(path)):
+        if is_python:
+            exec(compile(block, f"{path.name}, cell {number}", "exec"), names)
+        else:
+            for line in block:
+                carried_out(line)
+        plt.close("all")
+
+
+def test_the_index_of_the_site_names_every_page():
+    named = set(re.findall(r"^([\w/-]+)$", "".join(fenced(INDEX, "{toctree}")), re.M))
+    pages = {p.relative_to(INDEX.parent).with_suffix("").as_posix() for p in DOCUMENTS if p.parent != ROOT}
+    assert pages - {"index"} <= named
+
+
+def test_the_page_of_the_package_has_every_module_once():
+    named = re.findall(r"^   porrima\.(\w+)$", API.read_text(encoding="utf-8"), re.M)
+    assert sorted(named) == sorted(
+        p.stem for p in (ROOT / "src" / "porrima").glob("*.py") if p.stem != "__init__"
+    )
 
 
 @every_command

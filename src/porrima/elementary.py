@@ -19,7 +19,7 @@ __all__ = [
 ]  # fmt: skip
 
 TAIL = 5.0
-"""Argument from which a normal deviate is in the tail: |deviate| above 2.93, one of three hundred."""
+"""Argument from which a normal deviate is in the tail: beyond 2.93 on either side, one of three hundred."""
 
 _CONTRACT = {"contract"}  # a product and a sum may fuse; nothing else of IEEE is relaxed
 
