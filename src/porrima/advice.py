@@ -121,8 +121,10 @@ def advised(
     InputError
         If an option is wrong, all stars are saturated, or the cut is too wide for kernel moments.
     """
+    if survey is None:
+        raise InputError(f"must be one of {', '.join(EXPOSURES)}", key="--survey")
+    taken = known("--survey", survey, EXPOSURES)()
     own, requirement = survey_of(survey, requirements)
-    taken = known("--survey", survey or "", EXPOSURES)()
     plan = Plan(
         requirement=requirement,
         area=_positive("--patch-area", patch_area, taken.area, "deg²"),
@@ -156,11 +158,12 @@ def advised(
     fit = fit_response(profile, sizes)
     return {
         "survey": taken.name, "survey_source": taken.source, "requirement": requirement.name,
-        "source": requirement.source, "required_sigma_e": requirement.sigma_e, "required_sigma_r2": requirement.sigma_r2, "psf": profile.name,
-        "estimator": estimator, "r2_0": float(reply.shape0.r2), "e1_0": float(reply.shape0.e1),
-        "e2_0": float(reply.shape0.e2), "noise_of": noise, "band": config.stars.band, "saturation": taken.saturation,
-        "patch_area": plan.area, "cut": config.cut, "binary_fraction": binary_fraction, "sides": plan.sides,
-        "centre": plan.centre, "independent": independent, "weights": plan.weights, "corrected": corrected,
+        "source": requirement.source, "required_sigma_e": requirement.sigma_e,
+        "required_sigma_r2": requirement.sigma_r2, "psf": profile.name, "estimator": estimator,
+        "r2_0": float(reply.shape0.r2), "e1_0": float(reply.shape0.e1), "e2_0": float(reply.shape0.e2),
+        "noise_of": noise, "band": config.stars.band, "saturation": taken.saturation, "patch_area": plan.area,
+        "cut": config.cut, "binary_fraction": binary_fraction, "sides": plan.sides, "centre": plan.centre,
+        "independent": independent, "weights": plan.weights, "corrected": corrected,
         "configuration": config.model_dump(mode="json", exclude_none=True), "version": __version__,
         **_answer(choice, stars, companions, reply, fit),
     }  # fmt: skip

@@ -40,12 +40,14 @@ def choice_panels(answer: dict[str, Any]) -> Figure:
         The red dotted line is the requirement, the star the best setting.
     """
     with rc_context(STYLE):  # type: ignore[arg-type]
-        figure = Figure(figsize=(9.6, 6.8), layout="constrained")
-        axes = figure.subplots(2, 2)
-        _merits(figure, axes[0, 0], answer)
-        for axis, quantity in ((axes[0, 1], "r2"), (axes[1, 0], "e1")):
-            _parts(axis, answer, quantity)
-        _advice(axes[1, 1], answer)
+        figure = Figure(figsize=(11.4, 7.2), layout="constrained")
+        axes = figure.subplot_mosaic([["merit", "r2", "e"], ["advice"] * 3], height_ratios=(1.0, 0.8))
+        _merits(figure, axes["merit"], answer)
+        _parts(axes["r2"], answer, "r2")
+        worse = max(("e1", "e2"), key=lambda quantity: answer["best"][f"share_{quantity}"] or 0.0)
+        _parts(axes["e"], answer, worse)
+        axes["e"].legend(frameon=False, fontsize=7.5, loc="lower left")
+        _advice(axes["advice"], answer)
         figure.suptitle(
             f"{answer['survey']}: {answer['requirement']}, {answer['configuration']['multiplicity']['model']}, "
             f"patches of {answer['patch_area']:.2g} deg²",
@@ -56,7 +58,7 @@ def choice_panels(answer: dict[str, Any]) -> Figure:
 
 def _percent(clip: float | None, loosest: float) -> float:
     """Place of a clip on the axis: none stands beyond the loosest."""
-    return 100 * (loosest * 1.7 if clip is None else clip)
+    return 100 * (loosest * 2.4 if clip is None else clip)
 
 
 def _loosest(answer: dict[str, Any]) -> float:
@@ -88,7 +90,7 @@ def _merits(figure: Figure, axis: Any, answer: dict[str, Any]) -> None:
     for row in rows:
         merit[faint.index(row["mag_hi"]), clips.index(_percent(row["clip"], loosest))] = row["merit"]
     ratio = np.minimum(merit / best["merit"], 5.0)
-    edges = np.append(0.5 * (np.array([best["mag_lo"], *faint[:-1]]) + faint), faint[-1] + 0.5)
+    edges = np.append(np.array(faint) - 0.5, faint[-1] + 0.5)
     logs = np.log(clips)
     middle = 0.5 * (logs[1:] + logs[:-1])
     ends = np.exp([2 * logs[0] - middle[0], *middle, 2 * logs[-1] - middle[-1]]) if len(clips) > 1 else None
@@ -108,6 +110,7 @@ def _merits(figure: Figure, axis: Any, answer: dict[str, Any]) -> None:
         markeredgecolor="white",
     )
     axis.set_yticks(faint)
+    axis.set_ylim(edges[0], edges[-1])
     axis.set_ylabel("faint limit [mag]")
     axis.set_title(
         f"from {best['mag_lo']:g} mag, {best['n_exposures']} exposures; dots: within 10 %", fontsize=9
@@ -128,28 +131,21 @@ def _parts(axis: Any, answer: dict[str, Any], quantity: str) -> None:
     for part, label, colour, line in _PARTS:
         values = np.abs([row[f"{part}_{quantity}"] for row in rows]) / unit
         axis.plot(place, np.where(values > 0, values, np.nan), color=colour, linestyle=line, label=label)
-        shown.append(values[values > 0])
-    total = [
-        np.hypot(
-            abs(row[f"binaries_{quantity}"]) + abs(row[f"clip_bias_{quantity}"]),
-            np.hypot(row[f"scatter_{quantity}"], row[f"noise_{quantity}"]),
-        )
-        / unit
-        for row in rows
-    ]
-    axis.plot(place, total, color="black", linewidth=1.6, label="all")
+        shown.append(values)
+    total = [row[f"share_{quantity}"] for row in rows] if required is not None else shown[-1]
+    if required is not None:
+        axis.plot(place, total, color="black", linewidth=1.6, label="all")
     axis.axvline(_percent(answer["best"]["clip"], loosest), color="0.6", linewidth=0.8, linestyle=":")
     if required is not None:
         axis.axhline(1.0, color=_RED, linestyle=":", linewidth=1.2)
     axis.set_yscale("log")
     axis.set_ylim(3e-3 * max(total), 3 * max(total))
-    name = r"$R^2$" if quantity == "r2" else "$e_1$"
+    name = {"r2": "$R^2$", "e1": "$e_1$", "e2": "$e_2$"}[quantity]
     axis.set_ylabel(f"error of {name}" + (" over the requirement" if required is not None else ""))
     best = answer["best"]
     axis.set_title(
         f"{best['mag_lo']:g} to {best['mag_hi']:g} mag, {best['n_exposures']} exposures", fontsize=9
     )
-    axis.legend(frameon=False, fontsize=7.5, loc="lower right")
     _clip_axis(axis, answer)
 
 
@@ -157,12 +153,13 @@ def _advice(axis: Any, answer: dict[str, Any]) -> None:
     """Merit of each kind of advice, the best with its interval."""
     best = answer["best"]
     rows = [("best", best), *((row["advice"], row) for row in answer["runners_up"])]
-    for k, (name, row) in enumerate(rows):
+    for k, (_, row) in enumerate(rows):
         colour = _RED if not k else COLOURS[0]
         axis.barh(-k, row["merit"], color=colour, alpha=0.75, height=0.62)
         clip = "no clip" if row["clip"] is None else f"{100 * row['clip']:.2g} %"
         what = f"{row['mag_lo']:g}–{row['mag_hi']:g} mag, {clip}, {row['n_stars']:.0f} stars"
-        axis.text(row["merit"], -k, f"  {what}", va="center", fontsize=7.0)
+        place = row["merit"] if k else max(row["merit"], best["merit_high"])
+        axis.text(place, -k, f"  {what}", va="center", fontsize=7.5)
     low, high = best["merit_low"], best["merit_high"]
     axis.errorbar(
         best["merit"],
@@ -174,5 +171,5 @@ def _advice(axis: Any, answer: dict[str, Any]) -> None:
     )
     axis.axvline(1.0, color=_RED, linestyle=":", linewidth=1.2)
     axis.set_yticks([-k for k in range(len(rows))], [name for name, _ in rows], fontsize=7.5)
-    axis.set_xlim(0, 1.75 * max(1.0, *(row["merit"] for _, row in rows)))
+    axis.set_xlim(0, 1.3 * max(1.0, *(row["merit"] for _, row in rows)))
     axis.set_xlabel("largest rms error over the requirement")

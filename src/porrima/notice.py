@@ -90,12 +90,13 @@ def select_header(answer: dict[str, Any]) -> str:
     others = ", ".join(f"{row['model']} {row['merit']:.3g}" for row in answer["models"])
     lines = [
         f"{answer['survey']}: {answer['requirement']}, {', '.join(limits)}; {answer['psf']}, {answer['estimator']}, "
-        f"{model}, patches of {answer['patch_area']:.3g} deg², stars weighted {answer['weights']}, clipped on "
-        f"{answer['sides']} side{'s' if answer['sides'] == 'both' else ''}"
+        f"{model}, patches of {answer['patch_area']:.3g} deg², weights {answer['weights']}, clip about "
+        f"{'its own mean' if answer['centre'] == 'stack' else 'a known PSF'}, "
+        f"{'from both sides' if answer['sides'] == 'both' else 'from above'}"
         + (", predicted bias taken off" if answer["corrected"] else ""),
-        f"best: {best['mag_lo']:g}-{best['mag_hi']:g} mag, clip {_clip(best['clip'])}, {best['n_exposures']} exposures: "
-        f"{best['merit']:.3g} of the requirement ({best['merit_low']:.3g} to {best['merit_high']:.3g}; finite number of "
-        f"stars ± {best['merit_error']:.1g}); with {others}",
+        f"best: {best['mag_lo']:g}-{best['mag_hi']:g} mag, clip {_clip(best['clip'])}, {best['n_exposures']} "
+        f"exposures: {best['merit']:.3g} of the requirement ({best['merit_low']:.3g} to {best['merit_high']:.3g}; "
+        f"finite number of stars ± {best['merit_error']:.1g}); the same by {others}",
         f"as good to 10 %: bright limit {_span(good['bright_limit'])}, faint limit {_span(good['faint_limit'])} mag, "
         f"clip {_clip(good['clip'][0])} to {_clip(good['clip'][1])}, exposures "
         + ", ".join(map(str, good["n_exposures"])),

@@ -111,8 +111,8 @@ def kept_shapes(
               \frac{dA}{dt} = \sum \Big(g - \sigma^2 \frac{z}{\tau}\Big) \frac{\varphi(z)}{\tau}
 
     for the sum A of what is kept, summed over both edges.  A clip that is centred on the mean of the stars that it
-    keeps finds a size that is off by M/(1 - M'), with the variance of M over (1 - M')².  Without that, a clip into the noise
-    would seem to lower it.
+    keeps finds a size that is off by M/(1 - M'), with the variance of M over (1 - M')².  Without that, a clip into the
+    noise would seem to lower it.
 
     A clip from both sides keeps what that at t keeps less what that at -t keeps.  The noise of e1 and e2 follows that
     of the size by their correlation, and is free otherwise.  Gaussian noise; exact otherwise but for groups of
