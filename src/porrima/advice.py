@@ -125,19 +125,17 @@ def advised(
         raise InputError(f"must be one of {', '.join(EXPOSURES)}", key="--survey")
     taken = known("--survey", survey, EXPOSURES)()
     own, requirement = survey_of(survey, requirements)
+    if requirement.sigma_e is None and requirement.sigma_r2 is None:
+        raise InputError("must have sigma_e or sigma_r2", source=requirements, key="requirements")
     plan = Plan(
         requirement=requirement,
         area=_positive("--patch-area", patch_area, taken.area, "deg²"),
         exposures=_exposures(exposures, taken),
         threshold=_thresholds(clip),
-        sides=_one_of("--sides", sides, SIDES),
-        centre=_one_of("--centre", centre, CENTRES),
         independent=independent,
-        weights=_one_of("--weights", weights, WEIGHTS),
+        **_named(sides=(sides, SIDES), centre=(centre, CENTRES), weights=(weights, WEIGHTS)),
     )
-    _one_of("--noise", noise, NOISES)
-    if requirement.sigma_e is None and requirement.sigma_r2 is None:
-        raise InputError("must have sigma_e or sigma_r2", source=requirements, key="requirements")
+    _named(noise=(noise, NOISES))
     if binary_fraction is not None and not 0 <= binary_fraction <= 1:
         raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     sizes, ranges = galaxies_of(galaxy_size, galaxies), _unsaturated(magnitude_bins(mag, bins, step), taken)
@@ -156,16 +154,23 @@ def advised(
     left = left_after_correction(found, plan, stars, companions, reply) if corrected else None
     choice = choose(found, plan, left)
     fit = fit_response(profile, sizes)
+    head = _head(plan, taken, config) | {
+        "psf": profile.name, "estimator": estimator, "r2_0": float(reply.shape0.r2), "e1_0": float(reply.shape0.e1),
+        "e2_0": float(reply.shape0.e2), "noise_of": noise, "binary_fraction": binary_fraction, "corrected": corrected,
+    }  # fmt: skip
+    return head | _answer(choice, stars, companions, reply, fit)
+
+
+def _head(plan: Plan, taken: Exposures, config: PopulationConfig) -> dict[str, Any]:
+    """What a choice was made for."""
+    requirement = plan.requirement
     return {
-        "survey": taken.name, "survey_source": taken.source, "requirement": requirement.name,
-        "source": requirement.source, "required_sigma_e": requirement.sigma_e,
-        "required_sigma_r2": requirement.sigma_r2, "psf": profile.name, "estimator": estimator,
-        "r2_0": float(reply.shape0.r2), "e1_0": float(reply.shape0.e1), "e2_0": float(reply.shape0.e2),
-        "noise_of": noise, "band": config.stars.band, "saturation": taken.saturation, "patch_area": plan.area,
-        "cut": config.cut, "binary_fraction": binary_fraction, "sides": plan.sides, "centre": plan.centre,
-        "independent": independent, "weights": plan.weights, "corrected": corrected,
-        "configuration": config.model_dump(mode="json", exclude_none=True), "version": __version__,
-        **_answer(choice, stars, companions, reply, fit),
+        "survey": taken.name, "survey_source": taken.source, "saturation": taken.saturation,
+        "requirement": requirement.name, "source": requirement.source, "required_sigma_e": requirement.sigma_e,
+        "required_sigma_r2": requirement.sigma_r2, "band": config.stars.band, "cut": config.cut,
+        "patch_area": plan.area, "sides": plan.sides, "centre": plan.centre, "independent": plan.independent,
+        "weights": plan.weights, "configuration": config.model_dump(mode="json", exclude_none=True),
+        "version": __version__,
     }  # fmt: skip
 
 
@@ -177,9 +182,12 @@ def _positive(key: str, value: float | None, otherwise: float, unit: str) -> flo
     return value
 
 
-def _one_of(key: str, value: str, names: Sequence[str]) -> Any:
-    """An option that must be one of some names."""
-    return known(key, value, {name: name for name in names})
+def _named(**options: tuple[str, Sequence[str]]) -> dict[str, Any]:
+    """Options that must each be one of some names."""
+    return {
+        key: known(f"--{key}", value, {name: name for name in names})
+        for key, (value, names) in options.items()
+    }
 
 
 def _exposures(wanted: Sequence[int] | None, taken: Exposures) -> tuple[int, ...]:
