@@ -196,8 +196,8 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "receipt": {"diagrams", "errors", "io"},
     "advice": {
         "answers", "choice", "clipping", "companions", "config", "decision", "deconvolution", "errors", "exposure",
-        "galaxy", "margin", "moments", "own_sizes", "precision", "psf", "response", "sample", "shapes", "shear",
-        "stars", "truncation",
+        "galaxy", "instruments", "margin", "moments", "own_sizes", "precision", "psf", "response", "sample", "shapes",
+        "shear", "stars", "truncation",
     },
     "notice": {"choice_figure", "errors", "files", "io"},
     "options": {"errors"},

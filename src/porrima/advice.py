@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from porrima.choice import Choice, Setting
     from porrima.config import PopulationConfig
     from porrima.exposure import Exposures
+    from porrima.instruments import Requirement, Survey
     from porrima.psf import PSF
     from porrima.response import Response
     from porrima.shapes import Estimator
@@ -121,21 +122,15 @@ def advised(
     InputError
         If an option is wrong, all stars are saturated, or the cut is too wide for kernel moments.
     """
-    if survey is None:
-        raise InputError(f"must be one of {', '.join(EXPOSURES)}", key="--survey")
-    taken = known("--survey", survey, EXPOSURES)()
-    own, requirement = survey_of(survey, requirements)
-    if requirement.sigma_e is None and requirement.sigma_r2 is None:
-        raise InputError("must have sigma_e or sigma_r2", source=requirements, key="requirements")
-    plan = Plan(
-        requirement=requirement,
-        area=_positive("--patch-area", patch_area, taken.area, "deg²"),
-        exposures=_exposures(exposures, taken),
-        threshold=_thresholds(clip),
-        independent=independent,
-        **_named(sides=(sides, SIDES), centre=(centre, CENTRES), weights=(weights, WEIGHTS)),
+    own, taken, requirement = _of_survey(survey, requirements)
+    names = _named(
+        sides=(sides, SIDES), centre=(centre, CENTRES), weights=(weights, WEIGHTS), noise=(noise, NOISES)
     )
-    _named(noise=(noise, NOISES))
+    del names["noise"]
+    plan = Plan(
+        requirement=requirement, area=_positive("--patch-area", patch_area, taken.area, "deg²"),
+        exposures=_exposures(exposures, taken), threshold=_thresholds(clip), independent=independent, **names,
+    )  # fmt: skip
     if binary_fraction is not None and not 0 <= binary_fraction <= 1:
         raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     sizes, ranges = galaxies_of(galaxy_size, galaxies), _unsaturated(magnitude_bins(mag, bins, step), taken)
@@ -159,6 +154,17 @@ def advised(
         "e2_0": float(reply.shape0.e2), "noise_of": noise, "binary_fraction": binary_fraction, "corrected": corrected,
     }  # fmt: skip
     return head | _answer(choice, stars, companions, reply, fit)
+
+
+def _of_survey(survey: str | None, requirements: Path | None) -> tuple[Survey, Exposures, Requirement]:
+    """Survey, its exposures and what is required of its PSF."""
+    if survey is None:
+        raise InputError(f"must be one of {', '.join(EXPOSURES)}", key="--survey")
+    taken = known("--survey", survey, EXPOSURES)()
+    own, requirement = survey_of(survey, requirements)
+    if requirement.sigma_e is None and requirement.sigma_r2 is None:
+        raise InputError("must have sigma_e or sigma_r2", source=requirements, key="requirements")
+    return own, taken, requirement
 
 
 def _head(plan: Plan, taken: Exposures, config: PopulationConfig) -> dict[str, Any]:

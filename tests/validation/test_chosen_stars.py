@@ -1,5 +1,5 @@
-"""A choice of stars from end to end: noisy images of stars and pairs drawn with GalSim, each measured with HSM, clipped by
-its own size, and the images of those kept stacked and measured again.
+"""A choice of stars from end to end: noisy images of stars and pairs drawn with GalSim, each measured with HSM, clipped
+by its own size, and the images of those kept stacked and measured again.
 
 Kernel moments, responses and noise covariances of Porrima are only in the expectation.
 """
@@ -28,9 +28,9 @@ N_STACKS, N_STARS, SIDE = 100, 400, 33
 PIXEL, MAGNITUDE, FRACTION = 0.04, 20.0, 0.7
 EXPOSURE = replace(EUCLID_VIS_WIDE, pixel=PIXEL, n_exposures=1)
 TABLE = (
-    "12c Stars chosen by their own size, from end to end: 100 stacks of 400 stars of 20 mag behind `psf1` with a pixel of "
-    "0.04″, 70 % pairs, one exposure with the noise of Euclid's; drawn with GalSim, measured with HSM, clipped about the "
-    "known PSF, stacked and measured again, against the closed form; R² over its own, pulls in standard errors."
+    "12c Stars chosen by their own size, from end to end: 100 stacks of 400 stars of 20 mag behind `psf1` with a pixel "
+    "of 0.04″, 70 % pairs, one exposure with the noise of Euclid's; drawn with GalSim, measured with HSM, clipped "
+    "about the known PSF, stacked and measured again, against the closed form; R² over its own; pulls in standard errors"
 )
 
 
