@@ -207,6 +207,7 @@ def test_every_json_key_is_documented(monkeypatch, capsys, tmp_path):
         "stars": ["--l", 180, "--b", 60, "--area", 0.2, "--mag", 18, 19, "-o", stars],
         "predict": ["--stars", stars, "--mag", 18, 19, "--psf", "psf1", "--n-stars", 40],
         "budget": ["--stars", stars, "--mag", 18, 19, "--instrument", "kcm16"],
+        "select": ["--survey", "euclid-vis", "--stars", stars, "--area", 1, "--mag", 18, 19, "--clip", 0.01],
         "correct": [patches, "--stars", stars, "--mag", 18, 19, "--instrument", "kcm16"],
         "measure": [pairs, "--psf", "psf1"],
         "simulate": [config, "-o", run],

@@ -36,7 +36,7 @@ from porrima.options import (
     Seed,
     table_of,
 )  # fmt: skip
-from porrima.survey_commands import budget, correct
+from porrima.survey_commands import budget, correct, select
 from porrima.terminal import Progress, show
 
 __all__ = ["app", "main"]
@@ -186,6 +186,7 @@ def predict(
 
 app.command()(budget)
 app.command()(correct)
+app.command()(select)
 
 
 @app.command()

@@ -43,6 +43,12 @@ class Exposures:
         Dithered exposures of each star (count).
     saturation : float
         Magnitude above which no pixel of a star saturates, in mag.
+    area : float
+        Of the sky that falls on detectors in one exposure, in deg².
+    band : str
+        Of the photometry, in which stars and flux ratios of companions are taken.
+    vega_ab : float
+        AB magnitude of a star that has magnitude 0 in that band, in mag.
     source : str
         Where the figures come from; ``[?]`` marks one with a single weak source.
     """
@@ -56,6 +62,9 @@ class Exposures:
     pixel: float
     n_exposures: int
     saturation: float
+    area: float
+    band: str
+    vega_ab: float
     source: str
 
     def electrons(self, magnitude: FloatArray) -> FloatArray:
@@ -89,10 +98,14 @@ EUCLID_VIS_WIDE = Exposures(
     pixel=0.1,
     n_exposures=4,
     saturation=17.8,
+    area=36 * 4132 * 4096 * (0.1 / 3600) ** 2,
+    band="euclid_VIS",
+    vega_ab=0.0,
     source="zero point: the throughput of VIS (SVO, as in GalSim-Euclid-Like) and 0.9926 m²; time: 566 s nominal with "
     "560.5 s of open shutter, read noise, dithers: GalSim-Euclid-Like; sky: mean zodiacal light of 22.35 mag/arcsec², "
     "Laureijs et al. 2011, which Leinert et al. 1998 give at ecliptic latitude 30 deg; dark: less than 2 e-/h, "
-    "Cropper et al. 2016; saturation: full well of 2e5 e- (GalSim-Euclid-Like) in the brightest pixel [?]",
+    "Cropper et al. 2016; saturation: full well of 2e5 e- (GalSim-Euclid-Like) in the brightest pixel "
+    "[?]; area: 36 detectors of 4132 x 4096 pixels, Cropper et al. 2016",
 )
 """Four exposures of Euclid's wide survey."""
 
@@ -120,13 +133,17 @@ def roman_exposures(band: str = "H158") -> Exposures:
     place (ecliptic latitude 30 deg, 90 deg from the Sun), to which ``stray_light_fraction`` is added; the thermal
     background counts as dark current.  Time, read noise and the number of dithers are its constants.
 
+    The zero point of Vega is that of GalSim's spectrum of it.
+
     References
     ----------
     Rowe2015
     """
+    import galsim  # noqa: PLC0415  (half a second, where it is used only)
     import galsim.roman as roman  # noqa: PLC0415  (half a second, where it is used only)
 
     bandpass = roman.getBandpasses(AB_zeropoint=True)[band]
+    vega = galsim.SED("vega.txt", wave_type="nm", flux_type="flambda").calculateMagnitude(bandpass)
     return Exposures(
         name=f"Roman WFI, {band}",
         zero_point=float(bandpass.zeropoint + 2.5 * math.log10(roman.collecting_area)),
@@ -137,6 +154,9 @@ def roman_exposures(band: str = "H158") -> Exposures:
         pixel=roman.pixel_scale,
         n_exposures=roman.n_dithers,
         saturation=ROMAN_SATURATION,
+        area=roman.n_sca * (roman.n_pix * roman.pixel_scale / 3600) ** 2,
+        band=f"roman_F{band[1:].zfill(3)}",
+        vega_ab=float(vega),
         source="galsim.roman (GalSim 2.8); saturation: one secondary source without a date [?]",
     )
 

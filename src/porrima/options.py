@@ -10,10 +10,10 @@ import typer
 from porrima.errors import InputError
 
 __all__ = [
-    "Band", "BinaryFraction", "Catalogue", "Colour", "EstimatorName", "Format", "GalaxySize", "GalaxySizes",
-    "Instrument", "Jitter", "Json", "Latitude", "Longitude", "Mag", "Mapping", "MultiplicityName", "Output",
-    "PhotometryName", "Pixel", "PixelScale", "Plot", "Psf", "ReaderOptions", "Rejected", "Seed", "StarsTable",
-    "SurveyCut", "SurveyPsf", "table_of",
+    "Band", "BinaryFraction", "Catalogue", "Colour", "EstimatorName", "Folder", "Format", "GalaxySize",
+    "GalaxySizes", "Instrument", "Jitter", "Json", "Latitude", "Longitude", "Mag", "Mapping",
+    "MultiplicityName", "Output", "PhotometryName", "Pixel", "PixelScale", "Plot", "Psf", "ReaderOptions",
+    "Rejected", "Seed", "StarsTable", "Survey", "SurveyCut", "SurveyPsf", "table_of",
 ]  # fmt: skip
 
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
@@ -59,6 +59,8 @@ EstimatorName = Annotated[
     str, typer.Option("--estimator", help="adaptive, plain or gaussian:SIGMA [arcsec].")
 ]
 Instrument = Annotated[str | None, typer.Option(help="euclid-vis, roman-h158, rubin, kcm16 or massey13.")]
+Survey = Annotated[str | None, typer.Option("--survey", "--instrument", help="euclid-vis or roman-h158.")]
+Folder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder: table, numbers and figure.")]
 StarsTable = Annotated[Path | None, typer.Option("--stars", help="Table as `porrima stars` writes it.")]
 SurveyPsf = Annotated[str | None, typer.Option("--psf", help="Name of the PSF; the instrument's.")]
 BinaryFraction = Annotated[float | None, typer.Option(help="0 to 1; as the model gives it if not given.")]

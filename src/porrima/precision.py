@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["ShapeNoise", "fitted_noise", "influence", "measured_noise"]
+__all__ = [
+    "MAGNITUDES", "ShapeNoise", "covariance_at", "fitted_covariance", "fitted_noise", "influence",
+    "measured_covariance", "measured_noise",
+]  # fmt: skip
 
 STARS = 8
 """Places in the pixel over which variances are averaged (count)."""
@@ -179,22 +182,48 @@ def measured_noise(psf: PSF, exposures: Exposures, estimator: Estimator) -> Shap
 
     Notes
     -----
+    The diagonal of `measured_covariance`.
+    """
+    return _noise(f"{estimator.name}, {exposures.name}", measured_covariance(psf, exposures, estimator))
+
+
+def measured_covariance(psf: PSF, exposures: Exposures, estimator: Estimator) -> FloatArray:
+    r"""Covariance of the noise of shapes that an estimator measures on the pixels of every exposure, their mean taken.
+
+    Parameters
+    ----------
+    psf, exposures, estimator
+        As for `measured_noise`.
+
+    Returns
+    -------
+    covariance : (n, 3, 3) float array
+        Of e1, e2 and R² over R0² at `MAGNITUDES`, dimensionless.
+
+    Raises
+    ------
+    ValueError
+        If the estimator cannot measure a star on such pixels.
+
+    Notes
+    -----
     With the influence :math:`\psi` of a pixel on the shape of a star P of unit flux and the variance B of a pixel
     without a star, :math:`\sigma^2 = [\sum P \psi^2 / F + B \sum \psi^2 / F^2] / n` for n exposures of F electrons.
     First order in the noise: for stars whose flux is measured to 5 % or better.
     """
     wide = WEIGHT_SIGMAS * estimator.sigma if isinstance(estimator, GaussianWeight) else estimator.reach
     star = pointings(psf, exposures.pixel, dither_pattern(1), half_width=max(HALF_WIDTH, wide))
-    from_star, from_background = np.zeros(3), np.zeros(3)
+    from_star, from_background = np.zeros((3, 3)), np.zeros((3, 3))
     for phase in range(STARS):
         here = replace(star, place=dither_pattern(1, phase))
         image = here.images(np.zeros(1), np.zeros(1)).reshape(star.side, star.side)
-        square = influence(image, exposures.pixel, estimator, psf.fwhm / 2) ** 2
-        from_star += (square * np.maximum(image, 0.0)).sum(axis=(1, 2)) / STARS
-        from_background += square.sum(axis=(1, 2)) / STARS
-    flux = exposures.electrons(MAGNITUDES)[:, None]
-    variance = (from_star / flux + from_background * exposures.background / flux**2) / exposures.n_exposures
-    return _noise(f"{estimator.name}, {exposures.name}", variance)
+        each = influence(image, exposures.pixel, estimator, psf.fwhm / 2).reshape(3, -1)
+        from_star += (each * np.maximum(image, 0.0).ravel()) @ each.T / STARS
+        from_background += each @ each.T / STARS
+    flux = exposures.electrons(MAGNITUDES)[:, None, None]
+    return np.asarray(
+        (from_star / flux + from_background * exposures.background / flux**2) / exposures.n_exposures
+    )
 
 
 def fitted_noise(psf: PSF, exposures: Exposures, r2: float) -> ShapeNoise:
@@ -222,19 +251,57 @@ def fitted_noise(psf: PSF, exposures: Exposures, r2: float) -> ShapeNoise:
     multiply with the response of an estimator for its change.  It is the noise behind the statistic of `Detection`.
     """
     to_shape = np.array([[1.0, 0.0, -1.0], [0.0, 2.0, 0.0], [1.0, 0.0, 1.0]]) / r2
+    return _noise(f"fit, {exposures.name}", to_shape @ fitted_covariance(psf, exposures) @ to_shape.T)
+
+
+def fitted_covariance(psf: PSF, exposures: Exposures) -> FloatArray:
+    """Covariance of the noise of the three second moments of `fitted_noise`.
+
+    Parameters
+    ----------
+    psf, exposures
+        As for `fitted_noise`.
+
+    Returns
+    -------
+    covariance : (n, 3, 3) float array
+        Of qxx, qxy and qyy at `MAGNITUDES`, in arcsec⁴, averaged over the place of a star in its pixel.
+    """
     half = np.array([1.0, 1.0, 1.0, 0.5, 1.0, 0.5])[:, None]  # xy and yx are one
     star = pointings(psf, exposures.pixel, dither_pattern(exposures.n_exposures))
     flux = exposures.electrons(MAGNITUDES)
-    variance = np.zeros((flux.size, 3))
+    covariance = np.zeros((flux.size, 3, 3))
     for phase in range(STARS):
         templates = replace(star, place=dither_pattern(exposures.n_exposures, phase)).derivatives() * half
         for k, f in enumerate(flux.tolist()):
             weight = f / (exposures.background / f + np.maximum(templates[0], 0.0))
-            covariance = np.linalg.inv((templates * weight) @ templates.T)[3:, 3:]
-            variance[k] += np.diag(to_shape @ covariance @ to_shape.T) / STARS
-    return _noise(f"fit, {exposures.name}", variance)
+            covariance[k] += np.linalg.inv((templates * weight) @ templates.T)[3:, 3:] / STARS
+    return covariance
 
 
-def _noise(name: str, variance: FloatArray) -> ShapeNoise:
-    """Of variances (n, 3) of e1, e2 and R²/R0²."""
+def covariance_at(covariance: FloatArray, magnitude: FloatArray) -> FloatArray:
+    """Covariances of some magnitudes: the logarithm of each variance is linear between `MAGNITUDES`.
+
+    Parameters
+    ----------
+    covariance : (n, 3, 3) float array
+        At `MAGNITUDES`.
+    magnitude : (m,) float array
+        In mag.
+
+    Returns
+    -------
+    covariance : (m, 3, 3) float array
+        In the same unit of the first; correlations are linear, too.
+    """
+    sigma = np.sqrt(np.einsum("nqq->nq", covariance))
+    correlation = (covariance / sigma[:, :, None] / sigma[:, None, :]).reshape(-1, 9)
+    here = np.exp(np.stack([np.interp(magnitude, MAGNITUDES, np.log(s)) for s in sigma.T], axis=1))
+    between = np.stack([np.interp(magnitude, MAGNITUDES, c) for c in correlation.T], axis=1)
+    return np.asarray(between.reshape(-1, 3, 3) * here[:, :, None] * here[:, None, :])
+
+
+def _noise(name: str, covariance: FloatArray) -> ShapeNoise:
+    """Of covariances (n, 3, 3) of e1, e2 and R²/R0²."""
+    variance = np.einsum("nqq->nq", covariance)
     return ShapeNoise(name=name, variance_e=variance[:, :2].mean(axis=1), variance_r2=variance[:, 2])

@@ -13,6 +13,7 @@ from porrima.options import (
     Catalogue,
     Colour,
     EstimatorName,
+    Folder,
     Format,
     GalaxySize,
     GalaxySizes,
@@ -33,13 +34,14 @@ from porrima.options import (
     Rejected,
     Seed,
     StarsTable,
+    Survey,
     SurveyCut,
     SurveyPsf,
     table_of,
 )  # fmt: skip
 from porrima.terminal import show
 
-__all__ = ["budget", "correct"]
+__all__ = ["budget", "correct", "select"]
 
 
 def budget(
@@ -162,3 +164,85 @@ def correct(
     )  # fmt: skip
     write_correction(result, output, plot)
     show(result, as_json, correct_header(result), CORRECT_COLUMNS, correct_lines(result))
+
+
+Clips = Annotated[
+    list[float] | None,
+    typer.Option("--clip", help="Largest own change of R2 over R2 to be tried; again for more. 19 of them."),
+]
+Exposed = Annotated[
+    list[int] | None,
+    typer.Option("--exposures", help="Of each star, to be tried; again for more. All the survey's."),
+]
+Sides = Annotated[str, typer.Option(help="Clip both sides, or upper: stars that look too large alone.")]
+Centre = Annotated[str, typer.Option(help="Of the clip: stack (its own mean), or a known PSF.")]
+Independent = Annotated[
+    bool, typer.Option("--independent", help="Other exposures are stacked than are clipped.")
+]
+Weights = Annotated[str, typer.Option(help="Of stars: equal, or inverse-variance.")]
+Corrected = Annotated[
+    bool, typer.Option("--corrected", help="The predicted bias is taken off; models tell what is left.")
+]
+NoiseOf = Annotated[str, typer.Option("--noise", help="fitted, or measured by the estimator.")]
+CatalogueArea = Annotated[float | None, typer.Option("--area", help="That a catalogue covers [deg²].")]
+PatchArea = Annotated[
+    float | None, typer.Option(help="Whose stars make one PSF [deg²]; the survey's field of view.")
+]
+
+
+def select(
+    *,
+    survey: Survey = None,
+    requirements: Annotated[Path | None, typer.Option(help="YAML file: sigma_e, sigma_r2.")] = None,
+    stars: StarsTable = None,
+    catalog: Catalogue = None,
+    format: Format = None,  # noqa: A002
+    map: Mapping = None,  # noqa: A002
+    options: ReaderOptions = None,
+    area: CatalogueArea = None,
+    l: Longitude = None,
+    b: Latitude = None,
+    mag: Mag = (16.0, 24.0),
+    bins: Annotated[int | None, typer.Option(help="Equal bins of magnitude.")] = None,
+    step: Annotated[float | None, typer.Option(help="Width of a bin [mag]; 1 if not given.")] = None,
+    patch_area: PatchArea = None,
+    exposures: Exposed = None,
+    clip: Clips = None,
+    sides: Sides = "both",
+    centre: Centre = "stack",
+    independent: Independent = False,
+    weights: Weights = "equal",
+    corrected: Corrected = False,
+    noise: NoiseOf = "fitted",
+    psf: SurveyPsf = None,
+    pixel: Pixel = None,
+    pixel_scale: PixelScale = None,
+    jitter: Jitter = None,
+    estimator: EstimatorName = "adaptive",
+    binary_fraction: BinaryFraction = None,
+    galaxy_size: GalaxySize = None,
+    galaxies: GalaxySizes = None,
+    multiplicity: MultiplicityName = "dk13",
+    photometry: PhotometryName = "main-sequence",
+    band: Band = None,
+    cut: SurveyCut = None,
+    seed: Seed = 1,
+    output: Folder = None,
+    as_json: Json = False,
+) -> None:
+    """Which stars make the best PSF: magnitudes, clip and exposures with the smallest error."""
+    from porrima.advice import advised
+    from porrima.notice import SELECT_COLUMNS, prepared, select_header, select_lines, write_advice
+
+    catalog, format = table_of(stars, catalog, format)  # noqa: A001
+    prepared(output)
+    result = advised(
+        survey=survey, requirements=requirements, mag=mag, bins=bins, step=step, area=area, patch_area=patch_area,
+        exposures=exposures, clip=clip, sides=sides, centre=centre, independent=independent, weights=weights,
+        corrected=corrected, noise=noise, psf=psf, pixel=pixel, pixel_scale=pixel_scale, jitter=jitter,
+        estimator=estimator, binary_fraction=binary_fraction, galaxy_size=galaxy_size, galaxies=galaxies, cut=cut, l=l,
+        b=b, catalog=catalog, format=format, map=map, options=options, band=band, seed=seed,
+        multiplicity=multiplicity, photometry=photometry,
+    )  # fmt: skip
+    write_advice(result, output)
+    show(result, as_json, select_header(result), SELECT_COLUMNS, select_lines(result))
