@@ -386,13 +386,15 @@ def _coefficients(  # type: ignore[no-untyped-def]
                 _add_powers(density * 2.0 * (1.0 if end else 4.0 if k % 4 else 2.0), f, out[1, s])
 
 
-def separation_moments(population: Population) -> FloatArray:
+def separation_moments(population: Population, is_rough: bool = False) -> FloatArray:
     r"""Expectation of even powers of the separation below the cut, over the orbits of each star.
 
     Parameters
     ----------
     population : Population
         Of n stars.
+    is_rough : bool
+        Whether no error need be known: then both rules are the one in use.
 
     Returns
     -------
@@ -411,9 +413,11 @@ def separation_moments(population: Population) -> FloatArray:
     law = population.law
     place = np.log10(population.cut * population.stars.distance) - law.log_a  # of the cut over mean a, dex
     for sigma, beyond, mine in _kinds(law.log_a_sigma.round(12), (law.log_a_max - law.log_a).round(12)):
-        for rule in (0, 1):
+        for rule in (0,) if is_rough else (0, 1):
             found = _log_moments(sigma, beyond, population.projection, place[mine], rule)
             out[rule, mine] = np.exp(found)
+    if is_rough:
+        out[1] = out[0]
     return out
 
 
