@@ -65,6 +65,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "precision": {"exposure", "pointings", "psf", "shapes", "stamps"},
     "gaia_flags": {"selection"},
     "detection_figure": {"figures"},
+    "recognition": {"detection", "detection_figure", "exposure", "instruments", "io", "psf"},
     "kappa": {"files", "errors", "figures", "io", "moments", "psf", "response", "shapes"},
     "toy": {
         "errors", "figures", "files", "images", "instruments", "io", "moments", "psf", "response", "shapes", "systems",

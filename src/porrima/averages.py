@@ -253,14 +253,9 @@ def _mean_x2(part: TripleMoments) -> FloatArray:
 def _star_sums(fraction: FloatArray, integrals: PairIntegrals, weight: FloatArray, rule: int) -> FloatArray:
     """Sums over the stars of each multiplicity fraction, ascending: powers by a rule, and the weight lost to pairs."""
     values, which = np.unique(fraction, return_inverse=True)
-    order = np.argsort(which, kind="stable")
-    edges = np.searchsorted(which[order], np.arange(values.size + 1))
-    out = np.empty((values.size, _POWERS + 1))
-    out[:, -1] = np.bincount(which, weights=weight * integrals.lost, minlength=values.size)
-    for k in range(values.size):
-        mine = order[edges[k] : edges[k + 1]]
-        out[k, :-1] = integrals.sum_of_powers(weight[mine], mine, rule).ravel()
-    return out
+    lost = np.bincount(which, weights=weight * integrals.lost, minlength=values.size)
+    powers = integrals.sums_of_powers(weight, which, values.size, rule).reshape(-1, _POWERS)
+    return np.concatenate([powers, lost[:, None]], axis=1)
 
 
 def _star_counts(fraction: FloatArray, integrals: PairIntegrals, number: FloatArray) -> FloatArray:

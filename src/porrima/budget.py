@@ -332,7 +332,7 @@ def _totals(
 ) -> list[float]:
     """Rms errors of the quantities of which something is required, with another cut; NaN where there are none."""
     integrals = PairIntegrals(
-        cut=population.cut, coefficient=coefficient, separation=separation_moments(population)
+        cut=population.cut, coefficient=coefficient, separation=separation_moments(population, is_rough=True)
     )
     fraction = None if setting.binary_fraction is None else np.array([setting.binary_fraction])
     with warnings.catch_warnings():

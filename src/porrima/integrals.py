@@ -24,7 +24,7 @@ from porrima.photometry import magnitude_on_track
 from porrima.screen import screen_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
@@ -48,6 +48,7 @@ PRODUCTS = tuple((n, m) for n in range(2, ORDER + 1) for m in range(n, ORDER + 1
 
 _INTERVALS = 128  # of Simpson's rule over the logarithm of the mass ratio; the coarse rule takes half as many
 _STEP = 0.02  # dex of cut times distance over semi-major axis; the coarse rule takes twice as much
+_SPAN = 4  # dex to whose multiples a table reaches, so that one serves many magnitudes and cuts
 _LEAST = 1e-300  # so that a share which is 0 has a logarithm
 
 
@@ -109,27 +110,31 @@ class PairIntegrals:
             return self.joint[0, :, j, k]
         return self.coefficient[0, :, j] * self.separation[0, :, k]
 
-    def sum_of_powers(self, weight: FloatArray, star: IntArray, rule: int) -> FloatArray:
-        """Sum of all joint powers over some stars.
+    def sums_of_powers(self, weight: FloatArray, group: IntArray, n_groups: int, rule: int) -> FloatArray:
+        """Sums of all joint powers over the rows of some groups.
 
         Parameters
         ----------
-        weight : (m,) float array
-            Of each, dimensionless.
-        star : (m,) int array
-            Their numbers, dimensionless.
+        weight : (n,) float array
+            Of each row, dimensionless.
+        group : (n,) int array
+            Number of each row's group, dimensionless.
+        n_groups : int
+            Groups (count).
         rule : {0, 1}
             The rule in use or the coarser one.
 
         Returns
         -------
-        powers : (9, 9) float array
+        powers : (n_groups, 9, 9) float array
             Dimensionless.
         """
+        out = np.zeros((n_groups, ORDER + 1, ORDER + 1))
         if self.joint is not None:
-            return np.asarray(np.tensordot(weight, self.joint[rule, star], axes=1))
-        weighted = weight[:, None] * self.coefficient[rule, star]
-        return np.asarray(weighted.T @ self.separation[rule, star])
+            _add_joint(weight, group, self.joint[rule], out)
+        else:
+            _add_products(weight, group, self.coefficient[rule], self.separation[rule], out)
+        return out
 
     @property
     def mean(self) -> FloatArray:
@@ -258,11 +263,9 @@ def separations_below(
 
     def found(some: IntArray, fraction: FloatArray) -> FloatArray:
         out = np.empty((some.size, fraction.size, order + 1))
-        kinds, which = np.unique(np.stack([scatter[some], beyond[some]], axis=1), axis=0, return_inverse=True)
-        for number, (sigma, widest) in enumerate(kinds):
-            mine = which.ravel() == number
+        for sigma, widest, mine in _kinds(scatter[some], beyond[some]):
             at = (place[some[mine], None] + fraction).ravel()
-            log_moments = _log_moments(float(sigma), float(widest), population.projection, at, rule, order)
+            log_moments = _log_moments(sigma, widest, population.projection, at, rule, order)
             out[mine] = log_moments.reshape(-1, fraction.size, order + 1)
         return np.asarray(np.exp(out, out=out))
 
@@ -327,6 +330,27 @@ def _add_powers(weight, flux_ratio, out):  # type: ignore[no-untyped-def]
         out[j] += weight
 
 
+@njit(cache=True)
+def _add_products(weight, group, coefficient, separation, out):  # type: ignore[no-untyped-def]
+    """Add the products of both expectations of each row to its group's."""
+    for s in range(weight.size):
+        total = out[group[s]]
+        for j in range(total.shape[0]):
+            share = weight[s] * coefficient[s, j]
+            for k in range(total.shape[1]):
+                total[j, k] += share * separation[s, k]
+
+
+@njit(cache=True)
+def _add_joint(weight, group, joint, out):  # type: ignore[no-untyped-def]
+    """Add the joint expectations of each row to its group's."""
+    for s in range(weight.size):
+        total = out[group[s]]
+        for j in range(total.shape[0]):
+            for k in range(total.shape[1]):
+                total[j, k] += weight[s] * joint[s, j, k]
+
+
 @njit(cache=True, parallel=True)
 def _coefficients(  # type: ignore[no-untyped-def]
     grid, log_mass_min, dark_below, index, weight, mass, q_min, q_max, exponent, given, intervals, out
@@ -362,13 +386,15 @@ def _coefficients(  # type: ignore[no-untyped-def]
                 _add_powers(density * 2.0 * (1.0 if end else 4.0 if k % 4 else 2.0), f, out[1, s])
 
 
-def separation_moments(population: Population) -> FloatArray:
+def separation_moments(population: Population, is_rough: bool = False) -> FloatArray:
     r"""Expectation of even powers of the separation below the cut, over the orbits of each star.
 
     Parameters
     ----------
     population : Population
         Of n stars.
+    is_rough : bool
+        Whether no error need be known: then both rules are the one in use.
 
     Returns
     -------
@@ -386,25 +412,34 @@ def separation_moments(population: Population) -> FloatArray:
     out = np.empty((2, len(population.stars), ORDER + 1))
     law = population.law
     place = np.log10(population.cut * population.stars.distance) - law.log_a  # of the cut over mean a, dex
-    kinds, which = np.unique(
-        np.stack([law.log_a_sigma, law.log_a_max - law.log_a], axis=1).round(12), axis=0, return_inverse=True
-    )
-    for number, (sigma, beyond) in enumerate(kinds):
-        mine = which.ravel() == number
-        for rule in (0, 1):
-            found = _log_moments(float(sigma), float(beyond), population.projection, place[mine], rule)
+    for sigma, beyond, mine in _kinds(law.log_a_sigma.round(12), (law.log_a_max - law.log_a).round(12)):
+        for rule in (0,) if is_rough else (0, 1):
+            found = _log_moments(sigma, beyond, population.projection, place[mine], rule)
             out[rule, mine] = np.exp(found)
+    if is_rough:
+        out[1] = out[0]
     return out
+
+
+def _kinds(scatter: FloatArray, beyond: FloatArray) -> Iterator[tuple[float, float, IntArray]]:
+    """Scatters and truncations that occur together, and the rows that have them."""
+    (of_scatter, i), (of_beyond, j) = (np.unique(v, return_inverse=True) for v in (scatter, beyond))
+    number = i * of_beyond.size + j
+    order = np.argsort(number, kind="stable")
+    found, first = np.unique(number[order], return_index=True)
+    for kind, mine in zip(found.tolist(), np.split(order, first[1:]), strict=True):
+        one, other = divmod(kind, of_beyond.size)
+        yield float(of_scatter[one]), float(of_beyond[other]), mine
 
 
 def _log_moments(
     sigma: float, beyond: float, projection: Projection, place: FloatArray, rule: int, order: int = ORDER
 ) -> FloatArray:
     """Logarithms of the partial moments (n, order + 1) where cut times distance over mean axis is (n,), in dex."""
-    lowest = math.floor(min(place.min(), beyond - _STEP))
+    lowest = _SPAN * math.floor(min(place.min(), beyond - _STEP) / _SPAN)
     inside = np.minimum(place, beyond)
     if math.isinf(beyond):
-        highest, across = float(math.ceil(place.max()) + 1), inside
+        highest, across = float(_SPAN * math.ceil((place.max() + 1) / _SPAN)), inside
     else:
         highest, across = beyond, np.sqrt(beyond - inside)
     table = _separation_table(sigma, beyond, projection, lowest, highest, rule, order)

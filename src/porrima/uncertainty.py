@@ -378,7 +378,7 @@ def _rough(population: Population) -> PairIntegrals:
     return PairIntegrals(
         cut=population.cut,
         coefficient=coefficient_moments(population, _INTERVALS),
-        separation=separation_moments(population),
+        separation=separation_moments(population, is_rough=True),
     )
 
 
@@ -390,7 +390,7 @@ def _again(population: Population, integrals: PairIntegrals, moved: str) -> Pair
         return _rough(population)
     if moved == "mass_ratio_exponent":
         return replace(integrals, coefficient=coefficient_moments(population, _INTERVALS))
-    return replace(integrals, cut=population.cut, separation=separation_moments(population))
+    return replace(integrals, cut=population.cut, separation=separation_moments(population, is_rough=True))
 
 
 def _combined(name: str, changes: FloatArray) -> Source:
@@ -422,7 +422,9 @@ def _choices(
             same = tuple(flag and name != "projection" for name, flag in is_other.items())
             coefficient = out[same][1].coefficient
             integrals = PairIntegrals(
-                cut=population.cut, coefficient=coefficient, separation=separation_moments(population)
+                cut=population.cut,
+                coefficient=coefficient,
+                separation=separation_moments(population, is_rough=True),
             )
         else:
             integrals = _rough(population)
