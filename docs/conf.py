@@ -29,7 +29,7 @@ version = release = porrima.__version__
 
 # Of the tutorials: where `porrima` is, how wide its tables are, which Python runs.
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-os.environ["COLUMNS"] = "100"
+os.environ["COLUMNS"] = "116"
 os.environ["PYTHONPATH"] = str(HERE.parent / "src")
 os.environ["JUPYTER_PREFER_ENV_PATH"] = "1"
 
@@ -88,7 +88,9 @@ def _linked(match):
 
 
 def document_where_it_is_made(app, what, name, obj, skip, options):
-    """What a module hands on from another has its place there."""
+    """What a module hands on from another has its place there; a configuration's own settings have none."""
+    if name == "model_config":
+        return True
     here = app.env.current_document.autodoc_module
     there = getattr(obj, "__module__", None)
     return True if what == "module" and there and there.startswith("porrima.") and there != here else None

@@ -1,4 +1,8 @@
-"""The configuration of a run: validated YAML, every error naming its key."""
+"""The configuration of a run: validated YAML, every error naming its key.
+
+What each key means, with its unit and default, is said under `porrima simulate` and `porrima budget` in the reference
+of the commands.
+"""
 
 from __future__ import annotations
 

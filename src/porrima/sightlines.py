@@ -30,7 +30,7 @@ MARGIN = 0.1  # mag, by which the bounds on a cell's magnitudes may fail between
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sightline:
-    """A direction in cells of distance.
+    """A direction of the Galaxy: edges of its cells of distance, and what lies in each.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def sightline(
     extinction_per_kpc: float,
     warp: bool,
 ) -> Sightline:
-    """A direction in cells of distance.
+    """Sightline towards one direction.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cells:
-    """Cells that may hold stars of a range of magnitude.
+    """Cells of component, distance, metallicity and mass, and how many stars they hold.
 
     Parameters
     ----------
