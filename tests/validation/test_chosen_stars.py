@@ -121,6 +121,5 @@ def test_stacks_of_clipped_images_are_off_as_the_choice_says(
         [sides, threshold, f"{np.sqrt(noise[0, 2, 2]):.2e}", f"{expected[0]:.3f}", f"{expected[1]:.2e}",
          f"{theory.clip[0, 0, 0, 2]:.2e}", f"{expected[2]:.2e}", " ".join(f"{p:+.1f}" for p in pulls)],
     )  # fmt: skip
-    print(values, expected, pulls)
     for value, wanted, error in zip(values, expected, errors, strict=True):
         assert_within_sigma(value, wanted, error)
