@@ -9,12 +9,15 @@ from porrima.choice import THRESHOLDS, Plan, StarBin, choose, row_of, stacked
 from porrima.clip import Noise
 from porrima.clipping import clip_curve, count_pairs
 from porrima.instruments import KCM16
-from porrima.own_sizes import own_sizes, sorting, together
+from porrima.multiplicity import MULTIPLICITY
+from porrima.own_sizes import _spread, own_sizes, sorting, together
+from porrima.photometry import PHOTOMETRY
 from porrima.prediction import integrate, population_moments, predict
 from porrima.psf import psf_from_name
 from porrima.response import response
 from porrima.shapes import Adaptive
 from porrima.stack import draw_stacks
+from porrima.systems import Population
 from porrima.truncation import kept_shapes
 from statistics_helpers import assert_within_sigma
 
@@ -77,6 +80,17 @@ def test_without_a_clip_or_noise_a_stack_is_as_predicted(population, reply, size
     expected = predict(population_moments(population, integrate(population)), reply, 10_000)
     assert found.binaries[0] == pytest.approx(expected.bias[:, 0], rel=2e-3)
     assert np.sqrt(found.scatter[0] / 10_000) == pytest.approx(expected.sd[:, 0], rel=3e-3)
+
+
+@pytest.mark.parametrize("model", ["dk13-kcm16", "offner23"])
+def test_sizes_that_hardly_a_pair_has_are_numbers(stars, sorted_by, model):
+    few = stars.take(np.arange(40))
+    laws = {"multiplicity": MULTIPLICITY[model], "photometry": PHOTOMETRY["main-sequence"]}
+    found = own_sizes(count_pairs(Population.of(few, **laws)), sorted_by, MAGNITUDE)
+    squares = np.full(3, -1e-30), np.array([1e-20, 0.0, 1.0]), np.array([0.0, 0.1, 0.2])
+    assert np.all((_spread(*squares) >= 0) & (_spread(*squares) <= squares[2]))
+    assert np.all((found.spread >= 0) & (found.spread <= found.change))
+    assert np.all(np.isfinite(stacked([bin_of(found)], PLAN).merit(KCM16)))
 
 
 def test_a_clip_from_above_keeps_what_the_curve_of_clips_says(population, reply, sizes):

@@ -308,7 +308,7 @@ class Choice:
         setting : Setting
             The first of equal ones to 1e-9.
         """
-        merit = np.where(allowed, self.merit, np.inf)
+        merit = np.where(allowed & np.isfinite(self.merit), self.merit, np.inf)
         good = np.argwhere(merit <= merit.min() * (1 + 1e-9))
         return Setting(*(int(k) for k in good[np.argmin(good[:, 2])]))
 

@@ -46,7 +46,7 @@ def choice_panels(answer: dict[str, Any]) -> Figure:
         _parts(axes["r2"], answer, "r2")
         worse = max(("e1", "e2"), key=lambda quantity: answer["best"][f"share_{quantity}"] or 0.0)
         _parts(axes["e"], answer, worse)
-        axes["e"].legend(frameon=False, fontsize=7.5, loc="lower left")
+        axes["e"].legend(facecolor="white", edgecolor="none", fontsize=7.5, loc="lower left")
         _advice(axes["advice"], answer)
         figure.suptitle(
             f"{answer['survey']}: {answer['requirement']}, {answer['configuration']['multiplicity']['model']}, "

@@ -176,7 +176,7 @@ def own_sizes(counts: PairCounts, sorted_by: Sorting, magnitude: tuple[float, fl
         number=number,
         added=sums[..., 3:6] * scale,
         squared=sums[..., 6:9] * scale**2,
-        spread=np.sqrt(np.divide(sums[..., 1], number, out=np.zeros_like(number), where=number > 0)),
+        spread=_spread(sums[..., 1], number, change),
         x=sums[..., 2] * scale,
         total=float(counts.single.sum() + counts.pairs),
     )
@@ -207,10 +207,16 @@ def together(parts: Sequence[OwnSizes]) -> OwnSizes:
         magnitude=(weight * middle).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300),
         change=parts[0].change,
         number=total,
-        spread=np.sqrt(np.divide(spread, total, out=np.zeros_like(total), where=total > 0)),
+        spread=_spread(spread, total, parts[0].change),
         total=sum(part.total for part in parts),
         **summed,
     )
+
+
+def _spread(squares: FloatArray, number: FloatArray, change: FloatArray) -> FloatArray:
+    """Root mean square over pairs, no more than the change itself: what leans in a cell may leave next to none."""
+    mean = np.divide(squares, number, out=np.zeros_like(number), where=number > 0)
+    return np.minimum(np.sqrt(np.maximum(mean, 0.0)), change)
 
 
 def _between(four_y: FloatArray, values: FloatArray) -> FloatArray:
