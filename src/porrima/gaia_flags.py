@@ -11,8 +11,12 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.special import erf, ndtr
 
+from porrima.selection import probability_layer
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from porrima.selection import Layer
 
     FloatArray = NDArray[np.float64]
 
@@ -193,6 +197,23 @@ class GaiaFlags:
             )
         ruwe2 = 1 + np.where(pair, (rms(place).reshape(r.shape) / error) ** 2, 0.0)
         return np.asarray(1 - kept * (ruwe2 <= self.ruwe_max**2))
+
+    def layers(
+        self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray
+    ) -> tuple[Layer, ...]:
+        """The flags on a grid.
+
+        Parameters
+        ----------
+        separation, flux_ratio, magnitude : (n_r,), (n_f,), (n_m,) float array
+            In arcsec, dimensionless and mag.
+
+        Returns
+        -------
+        layers : tuple of Layer
+            One, in [0, 1].
+        """
+        return (probability_layer(self, separation, flux_ratio, magnitude),)
 
 
 def orbital_excess(period: FloatArray) -> FloatArray:
