@@ -155,6 +155,7 @@ UPSTREAM = {  # module: what it may import, anywhere in it. This table *is* the 
     "stack_rules": {"evidence"},
     "star_rules": {"evidence"},
     "statement_rules": {"evidence", "instruments", "stack_rules", "star_rules"},
+    "claim_table": {"claims"},
     "claims": {"archive", "cache", "evidence", "statement_rules"},
     "comparison": {
         "averages", "companions", "config", "integrals", "io", "multiplicity", "multiplicity_figure", "sample",

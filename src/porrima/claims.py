@@ -155,7 +155,10 @@ def claims_kept(results: Mapping[str, Parts], folder: Path) -> Parts:
 def _found(judgement: Judgement, why: str) -> dict[str, Any]:
     """The columns of a claim that the numbers decide."""
     one = judgement.deciding
-    said = [f"Not as stated: {m.quantity}, {_shown(m.value)} ± {_shown(m.error)}." for m in judgement.failed]
+    others = [
+        f"{m.quantity}: {_shown(m.value)} ± {_shown(m.error, 2)}" for m in judgement.failed if m is not one
+    ]
+    said = [f"Nor do these fit: {'; '.join(others)}."] if others else []
     if judgement.verdict == PARTLY:
         said += [f"The assumption: {'; '.join(judgement.assumptions)}."]
     said += [f"No number here of: {', '.join(judgement.open_parts)}."] if judgement.open_parts else []
@@ -168,12 +171,12 @@ def _found(judgement: Judgement, why: str) -> dict[str, Any]:
     }
 
 
-def _shown(value: float) -> str:
+def _shown(value: float, digits: int = 3) -> str:
     """A number in a sentence."""
     if value != 0 and not 1e-3 <= abs(value) < 1e4:
         mantissa, exponent = f"{value:.1e}".split("e")
         return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}".replace("-", "−")
-    return f"{value:.3g}".replace("-", "−")
+    return f"{value:.{digits}g}".replace("-", "−")
 
 
 def _columns(records: Sequence[Mapping[str, Any]], dimension: str) -> xr.Dataset:

@@ -333,7 +333,7 @@ def paper(
         "peak_memory_mb": peak_memory(),
     }
     near = [row for row in rows(first["summary"]) if row["f_lo"] <= 0.35 < row["f_hi"]]
-    counts = ", ".join(f"{count} {verdict}" for verdict, count in result["verdicts"].items() if count)
+    counts = ", ".join(f"{verdict}: {count}" for verdict, count in result["verdicts"].items() if count)
     show(result, as_json, f"report: {page}; statements: {counts}", NUMBER_COLUMNS, number_lines(near))
 
 

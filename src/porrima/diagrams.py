@@ -343,7 +343,7 @@ def pair_sketch(points: xr.Dataset) -> Figure:
         axis = figure.subplots()
         axis.plot([x[0], x[1]], [y[0], y[1]], color="0.5", linewidth=0.9, linestyle="--")
         for k, colour in ((0, COLOURS[0]), (1, COLOURS[1])):
-            axis.scatter(x[k], y[k], s=900 * flux[k], facecolor=colour, edgecolor="none")
+            axis.scatter(x[k], y[k], s=900 * flux[k], facecolor=colour, edgecolor="none", zorder=3)
         axis.plot(x[2], y[2], marker="x", markersize=9, markeredgewidth=2, color="0.1", linestyle="")
         for start, end, place, text in (
             ((x[0], y[0]), (x[1], y[0]), (0.62 * x[1], y[0] - 0.0032), r"$\delta x$"),

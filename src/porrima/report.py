@@ -100,9 +100,8 @@ def write_paper(
             write_rows(table.records, folder / f"{table.name}.ecsv")
         sections.append(section)
     behind = claim_numbers(numbers) if numbers else None
-    for name, records in (("claims", claims), ("claim_numbers", behind.records if behind else ())):
-        if records:
-            _write_records(records, folder / name)
+    if claims:
+        _write_claims(claims, behind.records if behind else [], folder)
     runs = {name: parts["findings"] for name, parts in results.items() if "config" in parts["findings"].attrs}
     page = Page(
         title="Errors and biases of the PSF from unresolved binary stars",
@@ -149,15 +148,24 @@ def _written(page: Page, path: Path) -> Path:
     return path
 
 
-def _write_records(records: Sequence[Mapping[str, Any]], stem: Path) -> None:
-    """Records as ECSV and as JSON, in which what is no number is null."""
-    write_rows([dict(record) for record in records], stem.with_suffix(".ecsv"))
-    clean = [
-        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in record.items()}
-        for record in records
-    ]
-    text = json.dumps(clean, indent=1, ensure_ascii=False, allow_nan=False)
-    write_whole(stem.with_suffix(".json"), lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+def _write_claims(
+    claims: Sequence[Mapping[str, Any]], numbers: Sequence[Mapping[str, Any]], folder: Path
+) -> None:
+    """Claims and the numbers behind them as ECSV, and all in one JSON file, in which what is no number is null."""
+    both = {"claims": claims, "numbers": numbers}
+    for name, records in zip(("claims", "claim_numbers"), both.values(), strict=True):
+        if records:
+            write_rows([dict(record) for record in records], folder / f"{name}.ecsv")
+    whole = {
+        name: [{key: _or_null(value) for key, value in record.items()} for record in records]
+        for name, records in both.items()
+    }
+    text = json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    write_whole(folder / "claims.json", lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+
+
+def _or_null(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _said(findings: xr.Dataset) -> dict[str, Any]:

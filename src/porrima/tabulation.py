@@ -134,9 +134,9 @@ def _by_contrast(parts: Parts) -> Iterator[dict[str, Any]]:
         yield {
             "companion": "as bright" if dm == 0 else "fainter",
             "Δm [mag]": dm,
-            "largest Δe/e where the paper reads it": float(here["de_rel_at_0_01"]),
-            "largest ΔR²/R² there": float(here["dr2_rel_at_0_01"]),
-            "separation of one per cent in e [arcsec]": float(here["radius_of_1_percent"]),
+            "Δe/e at most": float(here["de_rel_at_0_01"]),
+            "ΔR²/R² at most": float(here["dr2_rel_at_0_01"]),
+            "one per cent at [arcsec]": float(here["radius_of_1_percent"]),
         }
 
 
@@ -148,7 +148,7 @@ def _by_symbol(parts: Parts) -> Iterator[dict[str, Any]]:
         ("δx", "companion from the primary", "dx", "arcsec"),
         ("δy", "companion from the primary", "dy", "arcsec"),
         ("r", "separation", "separation", "arcsec"),
-        ("f r / (one + f)", "photocentre from the primary", "shift", "arcsec"),
+        ("(x̄, ȳ)", "distance of the photocentre from the primary", "shift", "arcsec"),
         ("x", "what the pair adds to R²", "x_second", "arcsec²"),
     ):
         yield {"symbol": symbol, "meaning": meaning, "value": float(found[name]), "unit": unit}
@@ -180,9 +180,9 @@ def _by_psf(parts: Parts) -> Iterator[dict[str, Any]]:
     """One record for each PSF of the paper."""
     table = parts["table"]
     heads = {
-        "e1": "e1", "e2": "e2", "e": "e", "angle_printed": "angle, printed [deg]", "angle": "angle [deg]",
-        "fwhm_printed": "FWHM, printed [arcsec]", "fwhm": "FWHM [arcsec]", "r2_0": "R² [arcsec²]",
-        "r2_0_optical": "R² of the optical one [arcsec²]", "e1_measured": "e1, measured", "e2_measured": "e2, measured",
+        "e1": "e1", "e2": "e2", "e": "e", "angle_printed": "printed [deg]", "angle": "angle [deg]",
+        "fwhm_printed": "FWHM, printed [″]", "fwhm": "FWHM [″]", "r2_0": "R² [arcsec²]",
+        "r2_0_optical": "R², optical", "e1_measured": "e1, measured", "e2_measured": "e2, measured",
     }  # fmt: skip
     for psf in table["psf"].to_numpy().tolist():
         here = table.sel(psf=psf)
@@ -240,7 +240,8 @@ def _compared(row: dict[str, Any], name: str) -> tuple[Markup, Markup]:
 
 
 def _plain(name: str, label: str, records: list[dict[str, Any]]) -> Table:
-    """Records as they are, with three figures; the first columns of them."""
+    """Records as they are, with some figures; the first columns of them."""
+    digits = 4 if name == "psf_table" else 3
     heads = tuple(records[0])[: _WIDER if name == "multiplicity_table" else _WIDEST]
     return Table(
         name=name,
@@ -248,9 +249,11 @@ def _plain(name: str, label: str, records: list[dict[str, Any]]) -> Table:
         caption=words(f"{name}_table", {}),
         heads=heads,
         rows=[
-            [row[head] if isinstance(row[head], str) else quoted(row[head]) for head in heads]
+            [row[head] if isinstance(row[head], str) else quoted(row[head], digits) for head in heads]
             for row in records
         ],
-        n_labels=1,
+        n_labels=next(
+            (k for k, head in enumerate(heads) if not isinstance(records[0][head], str)), len(heads)
+        ),
         records=records,
     )
