@@ -34,9 +34,7 @@ def claim_table(result: Mapping[str, Any]) -> str:
     """
     claims, numbers = result["claims"], result["numbers"]
     verdicts = [claim["verdict"] for claim in claims]
-    counts = ", ".join(
-        f"{verdicts.count(one)} {one}" for one in dict.fromkeys(sorted(verdicts, reverse=True))
-    )
+    counts = "; ".join(f"{one}: {verdicts.count(one)}" for one in VERDICTS if one in verdicts)
     of_claims = [
         [claim["number"], claim["statement"], claim["paper"], _measured(claim["porrima"], claim["error"]),
          claim["quantity"], f"**{claim['verdict']}**", claim["why"]]

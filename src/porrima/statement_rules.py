@@ -77,17 +77,23 @@ def _toy(data: Evidence) -> list[Measure]:
 
 
 def _sampled(data: Evidence) -> list[Measure]:
-    return [
-        measure(
-            "little impact",
-            f"change of size on {EUCLID_VIS.pixel}″ pixels over that without, {words}",
-            data.named(f"sampled_{name}"),
-            0.9,
-            1.1,
-            under=under,
-        )
-        for name, words, under in (("adaptive", "adaptive", ""), ("wide", "weight of 0.75″", UNWEIGHTED))
-    ]
+    out = []
+    for name, words, under in (("adaptive", "adaptive", ""), ("wide", "weight of 0.75″", UNWEIGHTED)):
+        change, share = data.named(f"sampled_{name}"), data.named(f"measured_{name}")
+        pixels = f"on {EUCLID_VIS.pixel}″ pixels"
+        out += [
+            measure(
+                "impact", f"change of size {pixels} over that without, {words}", change, 0.9, 1.1, under=under
+            ),
+            measure(
+                "measurable",
+                f"share of places in {EUCLID_VIS.pixel}″ pixels that are measured, {words}",
+                share,
+                0.9,
+                under=under,
+            ),
+        ]
+    return out
 
 
 def _size_budget(data: Evidence) -> list[Measure]:
@@ -100,7 +106,7 @@ def _size_budget(data: Evidence) -> list[Measure]:
     return [
         measure(
             f"{lo}–{lo + 1} mag",
-            f"share of the budget of the size, {lo} to {lo + 1} mag ({model})",
+            f"share of the budget of the size, Gaussian PSF, {lo} to {lo + 1} mag ({model})",
             data.named(f"size_share_{model}_{lo}"),
             under=under,
             **ends,
