@@ -297,6 +297,15 @@ def test_claims_have_a_section_only_where_there_are_some(results, page, tmp_path
         write_paper(one, tmp_path, [CLAIMS[0] | {"verdict": "maybe"}])
 
 
+def test_the_claims_lie_beside_the_page_with_all_their_digits(folder):
+    result = json.loads((folder / "claims.json").read_text(encoding="utf-8"))
+    assert result["claims"] == CLAIMS
+    assert [row["largest"] for row in result["numbers"]] == [None, None]
+    assert [row["value"] for row in result["numbers"]] == [1.25, 1.25]
+    assert len(Table.read(folder / "claims.ecsv")) == len(CLAIMS)
+    assert len(Table.read(folder / "claim_numbers.ecsv")) == len(NUMBERS)
+
+
 def test_figures_have_the_colours_of_the_page_and_names_of_their_own(folder, page):
     drawings = list(page.iter("{http://www.w3.org/2000/svg}svg")) or list(page.iter("svg"))
     assert len(drawings) == 6
