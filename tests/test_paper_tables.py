@@ -31,7 +31,8 @@ def test_each_reading_takes_the_printed_row_and_fills_the_gaps_its_own_way():
 
 
 def test_the_printed_position_angles_are_a_quarter_turn_off():
-    table, found = psf_table()["table"], psf_table()["findings"]
+    parts = psf_table()
+    table, found = parts["table"], parts["findings"]
     angle = table["angle"].to_numpy()
     assert angle[1:] == pytest.approx([178.4, 57.5], abs=0.05)
     assert float(found["most_turned"]) == pytest.approx(90.0, abs=0.05)
