@@ -53,3 +53,14 @@ def test_what_a_straight_line_leaves_of_an_orbit(period):
         y = np.sin(2 * np.pi * t * YEARS / period + phase)
         left.append(np.mean((y - np.polyval(np.polyfit(t, y, 1), t)) ** 2))
     assert orbital_excess(period) == pytest.approx(2 * np.mean(left), rel=2e-3)
+
+
+def test_the_flags_on_a_grid_are_those_of_each_pair():
+    flags = GaiaFlags()
+    separation, flux_ratio, magnitude = np.linspace(0, 0.2, 5), np.linspace(0, 1, 4), np.array([17.0, 19.0])
+    kept = np.prod(
+        [1 - layer.probability for layer in flags.layers(separation, flux_ratio, magnitude)], axis=0
+    )
+    assert kept.shape == (2, 4, 5)
+    each = flags.rejected(separation, flux_ratio[:, None], magnitude[:, None, None])
+    np.testing.assert_allclose(kept, 1 - each, rtol=1e-12)

@@ -70,18 +70,23 @@ def test_each_option_changes_what_it_is_about_and_no_other(tmp_path):
 
     first = settings()
     assert list(first) == [
-        "population", "errors_and_biases", "effect_of_n_stars", "errors_and_biases_kcm16", "errors_and_biases_optical",
-        "magnitude",
+        "toy", "sketch", "multiplicity_table", "population", "psf_table", "errors_and_biases", "effect_of_n_stars",
+        "errors_and_biases_kcm16", "errors_and_biases_optical", "magnitude", "statements",
     ]  # fmt: skip
     assert settings() == first
     stacks = {"errors_and_biases", "errors_and_biases_kcm16"}
     few = settings(n_stars=200)
     assert {name for name in first if few[name] != first[name]} == {*stacks, "errors_and_biases_optical"}
     other = settings(psf=("psf2",))
-    assert {name for name in other if other[name] != first[name]} == {*stacks, "effect_of_n_stars"}
+    assert {name for name in other if other[name] != first[name]} == {
+        *stacks,
+        "effect_of_n_stars",
+        "statements",
+    }
     assert "errors_and_biases_optical" not in other
     seeds = settings(seed=2)
-    assert {name for name in first if seeds[name] == first[name]} == {"population"}
+    unseeded = {"toy", "sketch", "multiplicity_table", "population", "psf_table"}
+    assert {name for name in first if seeds[name] == first[name]} == unseeded
 
 
 def test_a_wrong_option_is_refused_before_anything_is_made(tmp_path):

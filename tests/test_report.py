@@ -12,7 +12,9 @@ import yaml
 from astropy.table import Table
 
 from browser import Browser, executable
+from porrima.claims import VERDICTS
 from porrima.config import RunConfig, StarsConfig, parse
+from porrima.evidence import Number, measure
 from porrima.experiments import (
     against_magnitude,
     effect_of_n_stars,
@@ -22,16 +24,18 @@ from porrima.experiments import (
 )
 from porrima.figures import effect_of_n_stars as effect_of_n_stars_drawn
 from porrima.figures import errors_and_biases as drawn
-from porrima.findings import of_errors_and_biases, of_magnitude, of_population
+from porrima.findings import of_errors_and_biases, of_magnitude, of_population, of_toy
 from porrima.findings import of_n_stars as effect_parts
 from porrima.instruments import EUCLID_VIS, KCM16
 from porrima.multiplicity import MULTIPLICITY
+from porrima.paper_tables import multiplicity_table, pair_sketch, psf_table
 from porrima.programme import READINGS
 from porrima.report import write_paper, write_run
 from porrima.star_experiments import population
 from porrima.star_figures import selection
 from porrima.stars import Stars
 from porrima.summary import rows
+from porrima.toy import toy_maps
 from statistics_helpers import assert_within_sigma
 
 
@@ -139,7 +143,11 @@ def results(numbers, of_n_stars):
         np.array([18.0, 19.0, 20.0, 21.0]), {name: MULTIPLICITY[name] for name in READINGS}, n_drawn=100
     )
     return {
+        "toy": of_toy(toy_maps(points=9)),
+        "sketch": pair_sketch(),
+        "multiplicity_table": multiplicity_table({name: MULTIPLICITY[name] for name in READINGS}),
         "population": of_population(sky),
+        "psf_table": psf_table(),
         "errors_and_biases": of_errors_and_biases(numbers, KCM16),
         "effect_of_n_stars": effect_parts(of_n_stars, KCM16),
         "magnitude": of_magnitude(magnitude),
@@ -147,16 +155,22 @@ def results(numbers, of_n_stars):
 
 
 CLAIMS = [
-    {"number": 2, "statement": "Bias and error of the size are the same.", "paper": "σ ≃ bias", "porrima": 1.25,
-     "error": 0.0625, "verdict": verdict, "why": "The scatter of few stars < is added & counts."}
-    for verdict in ("holds", "holds under the paper's assumption only", "does not hold")
+    {"number": str(k), "statement": "Bias and error of the size are the same.", "paper": "σ ≃ bias",
+     "quantity": "σ over the bias", "porrima": 1.25, "error": 0.0625, "verdict": verdict,
+     "why": "The scatter of few stars < is added & counts."}
+    for k, verdict in enumerate(VERDICTS)
 ]  # fmt: skip
+NUMBERS = [
+    {"claim": "0", "part": "same"}
+    | measure("same", "σ over the bias", Number(1.25, error), 0.5, under=under).record()
+    for error, under in ((0.0625, ""), (0.0, "many stars"))
+]
 
 
 @pytest.fixture(scope="module")
 def folder(results, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    write_paper(results, folder, CLAIMS)
+    write_paper(results, folder, CLAIMS, NUMBERS)
     return folder
 
 
@@ -207,7 +221,7 @@ def labels(results):
 
 
 def test_every_number_in_the_page_is_one_that_was_saved(results, page):
-    known = saved(results) | numbers_in(CLAIMS)
+    known = saved(results) | numbers_in(CLAIMS) | numbers_in(NUMBERS)
     quotes = list(page.iter("data"))
     assert len(quotes) > 1000
     for quote in quotes:
@@ -273,24 +287,33 @@ def test_claims_have_a_section_only_where_there_are_some(results, page, tmp_path
     ids = {one.get("id") for one in page.iter() if one.get("id")}
     table = next(one for one in page.iter("table") if one.get("id") == "table-claims")
     assert "claims" in ids
-    assert len(table.findall("tbody/tr")) == 3
+    assert len(table.findall("tbody/tr")) == len(CLAIMS)
     one = {"errors_and_biases": results["errors_and_biases"]}
     without = parsed(write_paper(one, tmp_path))
     assert not [one for one in without.iter() if "claims" in (one.get("id") or one.get("href") or "")]
-    with pytest.raises(ValueError, match="a claim must have error, number"):
+    with pytest.raises(ValueError, match="a claim must have error, number, paper"):
         write_paper(one, tmp_path, [{"number": 1}])
     with pytest.raises(ValueError, match="verdict must be one of holds"):
         write_paper(one, tmp_path, [CLAIMS[0] | {"verdict": "maybe"}])
 
 
+def test_the_claims_lie_beside_the_page_with_all_their_digits(folder):
+    result = json.loads((folder / "claims.json").read_text(encoding="utf-8"))
+    assert result["claims"] == CLAIMS
+    assert [row["largest"] for row in result["numbers"]] == [None, None]
+    assert [row["value"] for row in result["numbers"]] == [1.25, 1.25]
+    assert len(Table.read(folder / "claims.ecsv")) == len(CLAIMS)
+    assert len(Table.read(folder / "claim_numbers.ecsv")) == len(NUMBERS)
+
+
 def test_figures_have_the_colours_of_the_page_and_names_of_their_own(folder, page):
     drawings = list(page.iter("{http://www.w3.org/2000/svg}svg")) or list(page.iter("svg"))
-    assert len(drawings) == 4
+    assert len(drawings) == 6
     ids = [one.get("id") for one in page.iter() if one.get("id")]
     assert len(ids) == len(set(ids))
     text = (folder / "index.html").read_text(encoding="utf-8").split("<svg")
     assert sum("var(--blue)" in one for one in text[1:]) >= 3
-    assert sum("drawing card" in one for one in text) == 1  # a map of colours stands on white
+    assert sum("drawing card" in one for one in text) == 2  # maps of colours stand on white
 
 
 def test_the_same_numbers_give_the_same_files_and_are_drawn_once(results, tmp_path):

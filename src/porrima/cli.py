@@ -307,6 +307,7 @@ def paper(
 ) -> None:
     """The paper's figures with their numbers, and one page about them; what is there already is used again."""
     from porrima.answers import NUMBER_COLUMNS, number_lines
+    from porrima.claims import VERDICTS, claims_kept, claims_of, numbers_of
     from porrima.files import make_folder
     from porrima.machine import peak_memory
     from porrima.programme import carried_out, programme
@@ -318,18 +319,22 @@ def paper(
     make_folder(output)
     start = time.perf_counter()
     results = dict(carried_out(experiments, output / "numbers", step))
-    page = write_paper(results, output)
+    decided = claims_kept(results, output / "numbers")
+    claims = claims_of(decided)
+    page = write_paper(results, output, claims, numbers_of(decided))
     first = results["errors_and_biases"]
     result = {
         "report": str(page),
         "n_stacks": int(first["findings"]["n_stacks"]),
         "n_stars": first["curves"].attrs["n_stars"],
         "n_stars_drawn": sum(one.size for one in experiments if one.unit == "stars"),
+        "verdicts": {verdict: [one["verdict"] for one in claims].count(verdict) for verdict in VERDICTS},
         "wall_s": time.perf_counter() - start,
         "peak_memory_mb": peak_memory(),
     }
     near = [row for row in rows(first["summary"]) if row["f_lo"] <= 0.35 < row["f_hi"]]
-    show(result, as_json, f"report: {page}", NUMBER_COLUMNS, number_lines(near))
+    counts = ", ".join(f"{verdict}: {count}" for verdict, count in result["verdicts"].items() if count)
+    show(result, as_json, f"report: {page}; statements: {counts}", NUMBER_COLUMNS, number_lines(near))
 
 
 @app.command()

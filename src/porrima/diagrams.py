@@ -17,7 +17,14 @@ if TYPE_CHECKING:
 
     from porrima.instruments import Requirement
 
-__all__ = ["against_magnitude", "budget_shares", "colour_against_eta", "correction_residuals", "corrections"]
+__all__ = [
+    "against_magnitude",
+    "budget_shares",
+    "colour_against_eta",
+    "correction_residuals",
+    "corrections",
+    "pair_sketch",
+]
 
 _RED = "#b00020"
 _TITLES = {"psf": "shape of the PSF", "fit": "shear, fit", "moments": "shear, moments"}
@@ -314,4 +321,44 @@ def correction_residuals(data: xr.Dataset) -> Figure:
         handles, names = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
         figure.suptitle(f"{data.attrs['psf']}, stacks of {data.attrs['n_stars']} stars", fontsize=9.5)
+    return figure
+
+
+def pair_sketch(points: xr.Dataset) -> Figure:
+    """A pair with the symbols of the paper (KCM16, Fig. 2): primary, companion, photocentre.
+
+    Parameters
+    ----------
+    points : Dataset
+        ``points`` of `paper_tables.pair_sketch`: places in arcsec from the primary, fluxes over that of the primary.
+
+    Returns
+    -------
+    figure : Figure
+        Areas of the stars go with their fluxes.
+    """
+    x, y, flux = (points[name].to_numpy() for name in ("x", "y", "flux"))
+    with rc_context(STYLE):  # type: ignore[arg-type]
+        figure = Figure(figsize=(5.2, 3.6), layout="constrained")
+        axis = figure.subplots()
+        axis.plot([x[0], x[1]], [y[0], y[1]], color="0.5", linewidth=0.9, linestyle="--")
+        for k, colour in ((0, COLOURS[0]), (1, COLOURS[1])):
+            axis.scatter(x[k], y[k], s=900 * flux[k], facecolor=colour, edgecolor="none", zorder=3)
+        axis.plot(x[2], y[2], marker="x", markersize=9, markeredgewidth=2, color="0.1", linestyle="")
+        for start, end, place, text in (
+            ((x[0], y[0]), (x[1], y[0]), (0.62 * x[1], y[0] - 0.0032), r"$\delta x$"),
+            ((x[1], y[0]), (x[1], y[1]), (x[1] + 0.0015, 0.45 * y[1]), r"$\delta y$"),
+        ):
+            axis.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": "0.3", "linewidth": 1.0})
+            axis.text(*place, text, fontsize=11)
+        for k, shift, text in (
+            (0, (-0.0005, -0.0068), r"$(\bar x_m, \bar y_m)$, $I_m$"),
+            (1, (-0.008, 0.0048), r"$(\bar x_c, \bar y_c)$, $I_c = f I_m$"),
+            (2, (-0.0105, 0.0022), r"$(\bar x, \bar y)$"),
+        ):
+            axis.text(x[k] + shift[0], y[k] + shift[1], text, fontsize=10, ha="left")
+        axis.text(0.62 * x[1] - 0.0015, 0.62 * y[1] + 0.001, "$r$", fontsize=11, ha="right")
+        axis.set(xlim=(-0.009, 0.052), ylim=(-0.009, 0.034), aspect="equal")
+        axis.set_xlabel("$x$ from the primary [arcsec]")
+        axis.set_ylabel("$y$ from the primary [arcsec]")
     return figure

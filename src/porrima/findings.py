@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from porrima.config import canonical
+from porrima.toy import headline
 
 if TYPE_CHECKING:
     from porrima.experiments import EffectOfNStars, ErrorsAndBiases
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
     Parts = dict[str, xr.Dataset]
 
-__all__ = ["of_errors_and_biases", "of_magnitude", "of_n_stars", "of_population"]
+__all__ = ["of_errors_and_biases", "of_magnitude", "of_n_stars", "of_population", "of_toy"]
 
 _COMPARED = ("bias", "sigma", "sd")
 
@@ -145,6 +146,32 @@ def of_magnitude(magnitude: xr.Dataset) -> Parts:
     bright, faint = (size.isel(bin=k).drop_vars(["mag_lo", "mag_hi"]) for k in bins)
     gain = bright / faint
     return {"magnitude": magnitude, "findings": xr.Dataset({"gain": gain})}
+
+
+def of_toy(maps: xr.Dataset) -> Parts:
+    """Maps of the toy model, with what is found in them.
+
+    Parameters
+    ----------
+    maps : Dataset
+        From `toy.toy_maps`.
+
+    Returns
+    -------
+    parts : dict
+        ``maps`` and ``findings``: the numbers of `toy.headline`, those of a contrast over ``delta_m`` [mag].
+    """
+    found = headline(maps)
+    contrasts = found.pop("contrasts")
+    of_contrast = {
+        name: ("delta_m", [row[name] for row in contrasts]) for name in contrasts[0] if name != "delta_m"
+    }
+    findings = xr.Dataset(
+        of_contrast | found,
+        coords={"delta_m": [row["delta_m"] for row in contrasts]},
+        attrs={"fwhm": maps.attrs["fwhm"], "ellipticity": maps.attrs["ellipticity"]},
+    )
+    return {"maps": maps, "findings": findings}
 
 
 def _agreement(summary: xr.Dataset) -> dict[str, float]:

@@ -33,8 +33,10 @@ __all__ = [
     "quoted",
 ]
 
-Verdict = Literal["holds", "holds under the paper's assumption only", "does not hold"]
-_KINDS: dict[str, str] = dict(zip(get_args(Verdict), ("holds", "partly", "fails"), strict=True))
+Verdict = Literal[
+    "holds", "holds under the paper's assumption only", "does not hold", "not checked with these options"
+]  # fmt: skip
+_KINDS: dict[str, str] = dict(zip(get_args(Verdict), ("holds", "partly", "fails", "open"), strict=True))
 _LONG = 24  # rows that stand open
 _FOLDER = Path(__file__).parent / "data" / "report"
 
@@ -151,12 +153,14 @@ class Claim:
         What is stated.
     paper : str
         The number that the paper gives, or its words.
-    porrima : float or str
-        What is found.
-    error : float, str or None
-        Its standard error, or what else it is known to.
-    verdict : {"holds", "holds under the paper's assumption only", "does not hold"}
-        Whether it holds.
+    quantity : str
+        What the number that is found is of.
+    porrima : float
+        What is found; NaN where nothing is.
+    error : float
+        Its standard error; 0 where it is exact.
+    verdict : str
+        Whether it holds: one of `Verdict`.
     why : str
         In a sentence.
 
@@ -169,8 +173,9 @@ class Claim:
     number: int | str
     statement: str
     paper: str
-    porrima: float | str
-    error: float | str | None
+    quantity: str
+    porrima: float
+    error: float
     verdict: Verdict
     why: str
 
@@ -249,6 +254,8 @@ class Page:
         The results.
     claims : tuple of Claim
         Left out where there are none.
+    claim_numbers : Table or None
+        All numbers behind them.
     configurations : tuple of Configuration
         What was run.
     versions : dict
@@ -263,6 +270,7 @@ class Page:
     answer: str
     sections: tuple[Section, ...]
     claims: tuple[Claim, ...] = ()
+    claim_numbers: Table | None = None
     configurations: tuple[Configuration, ...]
     versions: dict[str, str]
     references: list[Reference]
@@ -271,6 +279,12 @@ class Page:
     def version(self) -> str:
         """Of Porrima."""
         return self.versions["porrima"]
+
+    @property
+    def verdicts(self) -> dict[str, int]:
+        """How many claims have each verdict."""
+        found = [claim.verdict for claim in self.claims]
+        return {verdict: found.count(verdict) for verdict in _KINDS if verdict in found}
 
     @property
     def bibtex(self) -> str:

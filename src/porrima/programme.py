@@ -20,11 +20,14 @@ from porrima.experiments import (
     paper_config,
     store_name,
 )
-from porrima.findings import of_errors_and_biases, of_magnitude, of_n_stars, of_population
+from porrima.findings import of_errors_and_biases, of_magnitude, of_n_stars, of_population, of_toy
 from porrima.instruments import KCM16
 from porrima.multiplicity import MULTIPLICITY
+from porrima.paper_tables import multiplicity_table, pair_sketch, psf_table
 from porrima.psf import psf_from_name
 from porrima.star_experiments import N_DIRECTIONS, population
+from porrima.statements import N_STEPS, statement_numbers
+from porrima.toy import toy_maps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from porrima.config import RunConfig
+    from porrima.multiplicity import MultiplicityModel
 
     Parts = dict[str, xr.Dataset]
     Advance = Callable[[int], None]
@@ -116,9 +120,16 @@ def programme(
     )
     if psf is None:
         runs["errors_and_biases_optical"] = config.model_copy(update={"psf": OPTICAL})
-    experiments = [_sky(), *(_stacks(name, run, folder) for name, run in runs.items())]
-    experiments.insert(2, _n_stars(n_stars_configs(full=full, seed=seed, psf=psf), folder))
-    return [*experiments, _magnitude(4000 if full else 500, seed)]
+    stacks = [_stacks(name, run, folder) for name, run in runs.items()]
+    stacks.insert(1, _n_stars(n_stars_configs(full=full, seed=seed, psf=psf), folder))
+    n_drawn = 4000 if full else 500
+    tables = [
+        _small("multiplicity_table", lambda: multiplicity_table(_models())),
+        _sky(),
+        _small("psf_table", psf_table),
+    ]
+    last = [_magnitude(n_drawn, seed), _statements(config.psf, psf or OPTICAL, 4 * n_drawn, seed)]
+    return [_toy(), _small("sketch", pair_sketch), *tables, *stacks, *last]
 
 
 def carried_out(
@@ -194,7 +205,7 @@ def _sky() -> Experiment:
 
 def _magnitude(n_drawn: int, seed: int) -> Experiment:
     options: dict[str, Any] = {"n_drawn": n_drawn, "seed": seed}
-    models = {name: MULTIPLICITY[name] for name in READINGS}
+    models = _models()
     make = partial(against_magnitude, _EDGES, models, **options)
     return Experiment(
         name="magnitude",
@@ -202,4 +213,37 @@ def _magnitude(n_drawn: int, seed: int) -> Experiment:
         size=(_EDGES.size - 1) * len(models),
         unit="bins",
         make=lambda advance: of_magnitude(make(progress=advance)),
+    )
+
+
+def _models() -> dict[str, MultiplicityModel]:
+    return {name: MULTIPLICITY[name] for name in READINGS}
+
+
+def _small(name: str, make: Callable[[], Parts]) -> Experiment:
+    """An experiment that is done at once."""
+
+    def made(advance: Advance) -> Parts:
+        parts = make()
+        advance(1)
+        return parts
+
+    return Experiment(name=name, settings="", size=1, unit="table", make=made)
+
+
+def _toy() -> Experiment:
+    return Experiment(
+        name="toy", settings="", size=4, unit="maps", make=lambda advance: of_toy(toy_maps(progress=advance))
+    )
+
+
+def _statements(psf: tuple[str, ...], optical: tuple[str, ...], n_drawn: int, seed: int) -> Experiment:
+    options: dict[str, Any] = {"psf": psf, "optical": optical, "n_drawn": n_drawn, "seed": seed}
+    make = partial(statement_numbers, models=_models(), **options)
+    return Experiment(
+        name="statements",
+        settings=json.dumps(options, sort_keys=True),
+        size=N_STEPS,
+        unit="groups of numbers",
+        make=lambda advance: make(progress=advance),
     )

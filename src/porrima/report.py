@@ -3,45 +3,35 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from markupsafe import Markup
 
 from porrima import __version__
 from porrima.archive import fingerprint, source_key, versions
 from porrima.bibliography import bibliography, keys_of
 from porrima.cache import content_key
 from porrima.config import RunConfig, parse
-from porrima.diagrams import against_magnitude
+from porrima.diagrams import against_magnitude, pair_sketch
 from porrima.drawing import drawing, svg_of
-from porrima.figures import at_one_fraction, effect_of_n_stars, errors_and_biases
+from porrima.figures import at_one_fraction, effect_of_n_stars, errors_and_biases, toy_maps
 from porrima.files import write_whole
 from porrima.galaxy import Robin2003
 from porrima.instruments import KCM16
 from porrima.io import write_figure, write_rows
-from porrima.page import (
-    Configuration,
-    Page,
-    PageFigure,
-    Section,
-    Table,
-    claims_from,
-    html,
-    plain,
-    quoted,
-    words,
-)  # fmt: skip
+from porrima.page import Configuration, Page, PageFigure, Section, claims_from, html, words
 from porrima.shapes import estimator_from_name
 from porrima.star_figures import population
-from porrima.summary import rows
+from porrima.tabulation import claim_numbers, table_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     import xarray as xr
+    from markupsafe import Markup
     from matplotlib.figure import Figure
 
     Parts = dict[str, xr.Dataset]
@@ -49,23 +39,35 @@ if TYPE_CHECKING:
 __all__ = ["write_paper", "write_run"]
 
 _TITLES = {
+    "toy": "One companion anywhere",
+    "sketch": "A pair",
+    "multiplicity_table": "The multiplicity table",
     "population": "The stars",
+    "psf_table": "The PSFs",
     "errors_and_biases": "Errors and biases against binary fraction",
     "effect_of_n_stars": "Number of stars in a stack",
     "errors_and_biases_kcm16": "The other reading of the multiplicity table",
     "errors_and_biases_optical": "Optical PSFs",
     "magnitude": "Against magnitude",
 }
+_KINDS = (
+    "toy",
+    "sketch",
+    "multiplicity_table",
+    "population",
+    "psf_table",
+    "magnitude",
+)  # alone of their kind
+_WITHOUT_SECTION = ("statements",)  # whose numbers stand with the claims
 _ONE = "Bias and scatter at one binary fraction"
-_HEADS = (
-    "PSF", "quantity", "binary fraction", "stacks", "bias", "predicted", "σ", "predicted", "sd", "predicted",
-)  # fmt: skip
-_QUANTITIES = {"r2": Markup("R²"), "e1": Markup("e<sub>1</sub>"), "e2": Markup("e<sub>2</sub>")}
-_WIDEST = 10  # columns shown; all are in the files
-_SCANS = {"l = 0": "latitude at l = 0°", "l = 180": "latitude at l = 180°", "b = 45": "longitude at b = 45°"}
 
 
-def write_paper(results: Mapping[str, Parts], folder: Path, claims: Sequence[Mapping[str, Any]] = ()) -> Path:
+def write_paper(
+    results: Mapping[str, Parts],
+    folder: Path,
+    claims: Sequence[Mapping[str, Any]] = (),
+    numbers: Sequence[Mapping[str, Any]] = (),
+) -> Path:
     """Path of the page of the paper, with its figures (SVG, PDF, PNG) and tables (ECSV) beside it.
 
     Parameters
@@ -75,8 +77,9 @@ def write_paper(results: Mapping[str, Parts], folder: Path, claims: Sequence[Map
     folder : Path
         Where to write; it exists.
     claims : sequence of dict
-        Records with the keys of `page.Claim`: ``number, statement, paper, porrima, error, verdict, why``.  Without
-        any the section is left out.
+        Records with the keys of `page.Claim`.  Without any the section is left out.
+    numbers : sequence of dict
+        All numbers behind the claims, from `claims.numbers_of`.
 
     Returns
     -------
@@ -90,16 +93,22 @@ def write_paper(results: Mapping[str, Parts], folder: Path, claims: Sequence[Map
     """
     stated, sections = claims_from(claims), []
     for name, parts in results.items():
+        if name in _WITHOUT_SECTION:
+            continue
         section = _section(name, parts, _drawn(name, parts, folder))
         for table in section.tables:
             write_rows(table.records, folder / f"{table.name}.ecsv")
         sections.append(section)
+    behind = claim_numbers(numbers) if numbers else None
+    if claims:
+        _write_claims(claims, behind.records if behind else [], folder)
     runs = {name: parts["findings"] for name, parts in results.items() if "config" in parts["findings"].attrs}
     page = Page(
         title="Errors and biases of the PSF from unresolved binary stars",
         subtitle="The figures of Kuntzer, Courbin & Meylan (2016), simulated and predicted",
         sections=tuple(sections),
         claims=stated,
+        claim_numbers=behind,
         **_said(results["errors_and_biases"]["findings"]),
         **_provenance(runs),
     )
@@ -126,7 +135,7 @@ def write_run(parts: Parts, name: str, path: Path) -> Path:
     page = Page(
         title=f"The run {name}",
         subtitle="What unresolved binary stars do to the PSF of its stacks, simulated and predicted",
-        sections=(_section("errors_and_biases", parts, svg_of(_figure("errors_and_biases", parts))),),
+        sections=(_section("errors_and_biases", parts, svg_of(_drawing_of("errors_and_biases", parts))),),
         **_said(parts["findings"]),
         **_provenance({name: parts["findings"]}),
     )
@@ -137,6 +146,26 @@ def _written(page: Page, path: Path) -> Path:
     text = html(page)
     write_whole(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
     return path
+
+
+def _write_claims(
+    claims: Sequence[Mapping[str, Any]], numbers: Sequence[Mapping[str, Any]], folder: Path
+) -> None:
+    """Claims and the numbers behind them as ECSV, and all in one JSON file, in which what is no number is null."""
+    both = {"claims": claims, "numbers": numbers}
+    for name, records in zip(("claims", "claim_numbers"), both.values(), strict=True):
+        if records:
+            write_rows([dict(record) for record in records], folder / f"{name}.ecsv")
+    whole = {
+        name: [{key: _or_null(value) for key, value in record.items()} for record in records]
+        for name, records in both.items()
+    }
+    text = json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    write_whole(folder / "claims.json", lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+
+
+def _or_null(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _said(findings: xr.Dataset) -> dict[str, Any]:
@@ -192,13 +221,15 @@ def _numbers(findings: xr.Dataset) -> dict[str, Any]:
     }
 
 
-def _drawn(name: str, parts: Parts, folder: Path) -> str:
+def _drawn(name: str, parts: Parts, folder: Path) -> str | None:
     """The figure of an experiment as SVG, drawn to its files unless they show the same numbers already."""
+    if _kind(name, parts) not in _FIGURES:
+        return None
     files = [folder / f"{name}.{suffix}" for suffix in ("svg", "pdf", "png")]
     note = folder / f".{name}.key"
     key = content_key(fingerprint(parts), source_key("figures", "star_figures", "diagrams", "drawing"))
     if not all(file.is_file() for file in (*files, note)) or note.read_text(encoding="ascii") != key:
-        figure = _figure(name, parts)
+        figure = _drawing_of(name, parts)
         svg = svg_of(figure)
         write_whole(files[0], lambda unfinished: unfinished.write_text(svg, encoding="utf-8"))
         for file in files[1:]:
@@ -207,145 +238,51 @@ def _drawn(name: str, parts: Parts, folder: Path) -> str:
     return files[0].read_text(encoding="utf-8")
 
 
-def _section(name: str, parts: Parts, svg: str) -> Section:
+def _section(name: str, parts: Parts, svg: str | None) -> Section:
     """All that the page says of an experiment."""
     findings, kind = parts["findings"], _kind(name, parts)
     config = _config(findings) if "config" in findings.attrs else None
     about = {key: value for part in parts.values() for key, value in part.attrs.items()} | {
         "experiment": name
     }
-    label, caption, text = (
-        words(f"{kind}_{piece}", _numbers(findings), config, about) for piece in ("label", "caption", "text")
-    )
-    shown = PageFigure(
-        name=name,
-        label=label,
-        drawing=drawing(svg, name, label.striptags(), caption.striptags()),
-        caption=caption,
-    )
+
+    def said(piece: str) -> Markup:
+        return words(f"{kind}_{piece}", _numbers(findings), config, about)
+
     title = _ONE if kind == "one" else _TITLES[name]
-    make = _plain if kind in ("population", "magnitude") else _statistics
-    table = make(name, title, _records(kind, parts))
-    return Section(name=name.replace("_", "-"), title=title, text=(text,), figures=(shown,), tables=(table,))
+    figures = []
+    if svg is not None:
+        label, caption = said("label"), said("caption")
+        drawn = drawing(svg, name, label.striptags(), caption.striptags())
+        figures.append(PageFigure(name=name, label=label, drawing=drawn, caption=caption))
+    return Section(
+        name=name.replace("_", "-"),
+        title=title,
+        text=(said("text"),),
+        figures=tuple(figures),
+        tables=(table_of(kind, name, title, parts),),
+    )
 
 
 def _kind(name: str, parts: Parts) -> str:
     """What an experiment is like: its words and its figure go by it."""
-    if name in ("population", "magnitude"):
+    if name in _KINDS:
         return name
     if name == "effect_of_n_stars":
         return "n_stars"
     return "errors" if _config(parts["findings"]).binary_fraction == "uniform" else "one"
 
 
-def _figure(name: str, parts: Parts) -> Figure:
-    kind = _kind(name, parts)
-    if kind == "population":
-        return population(parts["sky"])
-    if kind == "magnitude":
-        return against_magnitude(parts["magnitude"], KCM16)
-    if kind == "n_stars":
-        return effect_of_n_stars(parts["numbers"], parts["limit"], KCM16)
-    if kind == "errors":
-        return errors_and_biases(parts["summary"], parts["curves"], parts["limit"], KCM16)
-    return at_one_fraction(parts["summary"], KCM16)
+def _drawing_of(name: str, parts: Parts) -> Figure:
+    return _FIGURES[_kind(name, parts)](parts)
 
 
-def _records(kind: str, parts: Parts) -> list[dict[str, Any]]:
-    """The table of an experiment, with all its digits."""
-    if kind == "population":
-        return list(_by_direction(parts["sky"]))
-    if kind == "magnitude":
-        return list(_by_magnitude(parts["magnitude"]))
-    if kind == "n_stars":
-        numbers = parts["numbers"]
-        stars = numbers["n_stars"].to_numpy().tolist()
-        return [{"n_stars": n} | row for n in stars for row in rows(numbers.sel(n_stars=n))]
-    return rows(parts["summary"])
-
-
-def _by_direction(sky: xr.Dataset) -> Iterator[dict[str, Any]]:
-    """One record for each direction of each scan."""
-    for scan in sky["scan"].to_numpy().tolist():
-        here = sky.sel(scan=scan).dropna("angle", subset=["n_per_deg2"])
-        for k in range(here.sizes["angle"]):
-            one = here.isel(angle=k)
-            yield (
-                {"along": _SCANS[scan], "angle": float(one["angle"])}
-                | {
-                    f"stars {kind}": float(one["share"].sel(mass_class=kind))
-                    for kind in one["mass_class"].to_numpy()
-                }
-                | {
-                    f"binary fraction, {rule} row": float(one["binary_fraction"].sel(gap_rule=rule))
-                    for rule in one["gap_rule"].to_numpy()
-                }
-                | {"stars per deg²": float(one["n_per_deg2"])}
-            )
-
-
-def _by_magnitude(data: xr.Dataset) -> Iterator[dict[str, Any]]:
-    """One record for each model and bin."""
-    for model in data["model"].to_numpy().tolist():
-        for k in range(data.sizes["bin"]):
-            one = data.sel(model=model).isel(bin=k)
-            names = ("mag_lo", "mag_hi", "mean_x", "mean_x_low", "mean_x_high")
-            yield (
-                {"model": model}
-                | {name: float(one[name]) for name in names}
-                | {
-                    f"{name}, {psf}": float(one[name].sel(psf=psf))
-                    for name in ("limit_e", "limit_r2")
-                    for psf in one["psf"].to_numpy()
-                }
-            )
-
-
-def _statistics(name: str, label: str, records: list[dict[str, Any]]) -> Table:
-    """Bias, error and scatter with their standard errors beside the predictions."""
-    many = "n_stars" in records[0]
-    shown = [
-        [
-            *([plain(row["n_stars"])] if many else []),
-            row["psf"],
-            _QUANTITIES[row["quantity"]],
-            Markup("{}–{}").format(plain(row["f_lo"]), plain(row["f_hi"])),
-            plain(row["n_stacks"]),
-            *(cell for one in ("bias", "sigma", "sd") for cell in _compared(row, one)),
-        ]
-        for row in records
-    ]
-    return Table(
-        name=name,
-        label=label,
-        caption=Markup("Bias, rms error σ and scatter sd, with standard errors, in units of 10<sup>−3</sup>"),
-        heads=(*(("stars",) if many else ()), *_HEADS),
-        rows=shown,
-        n_labels=3 if many else 2,
-        records=records,
-    )
-
-
-def _compared(row: dict[str, Any], name: str) -> tuple[Markup, Markup]:
-    """A simulated number with its standard error, and the predicted one."""
-    value, error, predicted = (
-        quoted(row[key], 4, scale=1e-3, fixed=True) for key in (name, f"{name}_se", f"prediction_{name}")
-    )
-    return Markup("{} ± {}").format(value, error), predicted
-
-
-def _plain(name: str, label: str, records: list[dict[str, Any]]) -> Table:
-    """Records as they are, with three figures; the first columns of them."""
-    heads = tuple(records[0])[:_WIDEST]
-    return Table(
-        name=name,
-        label=label,
-        caption=words(f"{name}_table", {}),
-        heads=heads,
-        rows=[
-            [row[head] if isinstance(row[head], str) else quoted(row[head]) for head in heads]
-            for row in records
-        ],
-        n_labels=1,
-        records=records,
-    )
+_FIGURES: dict[str, Callable[[Parts], Figure]] = {
+    "toy": lambda parts: toy_maps(parts["maps"]),
+    "sketch": lambda parts: pair_sketch(parts["points"]),
+    "population": lambda parts: population(parts["sky"]),
+    "magnitude": lambda parts: against_magnitude(parts["magnitude"], KCM16),
+    "n_stars": lambda parts: effect_of_n_stars(parts["numbers"], parts["limit"], KCM16),
+    "errors": lambda parts: errors_and_biases(parts["summary"], parts["curves"], parts["limit"], KCM16),
+    "one": lambda parts: at_one_fraction(parts["summary"], KCM16),
+}

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
+from scipy.optimize import brentq
 
 from porrima import figures
 from porrima.errors import InputError
@@ -20,6 +21,7 @@ from porrima.shapes import Adaptive
 from porrima.systems import Systems
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -36,6 +38,9 @@ PIXEL = EUCLID_VIS.pixel
 NEAR = 0.01
 """Separation at which the paper reads its maps, in arcsec (KCM16 Sect. 2)."""
 
+ONE_PERCENT = 0.01
+"""Relative error of the ellipticity that the paper finds there (dimensionless)."""
+
 
 def toy_maps(
     *,
@@ -43,6 +48,7 @@ def toy_maps(
     ellipticity: float = 0.05,
     magnitude_differences: tuple[float, ...] = (0.0, 1.0),
     points: int = 61,
+    progress: Callable[[int], None] = lambda _: None,
 ) -> xr.Dataset:
     r"""Shape of a star with one companion, for every place of the companion in the central pixel (KCM16, Fig. 1).
 
@@ -56,6 +62,8 @@ def toy_maps(
         Companion fainter than the primary by so much, in mag, 0 or more.
     points : int
         Places along each side of the pixel, odd (count).
+    progress : callable
+        Called with the number of maps done, one for each PSF and magnitude difference (count).
 
     Returns
     -------
@@ -90,9 +98,12 @@ def toy_maps(
         sheared_gaussian("PSF along e2", 0.0, ellipticity, fwhm),
     ]
     x, y = np.meshgrid(side, side)
-    found = [
-        [_pairs(psf, 10 ** (-0.4 * dm), x.ravel(), y.ravel()) for dm in magnitude_differences] for psf in psfs
-    ]
+    found = []
+    for psf in psfs:
+        found.append(
+            [_all_around(psf, 10 ** (-0.4 * dm), x.ravel(), y.ravel()) for dm in magnitude_differences]
+        )
+        progress(len(magnitude_differences))
     dimensions = ("psf", "delta_m", "y", "x")
     shape0 = [response(psf, Adaptive()).shape0 for psf in psfs]
     size0 = np.array([s.r2 for s in shape0])[:, None, None, None]
@@ -117,6 +128,13 @@ def toy_maps(
     )
 
 
+def _all_around(psf: PSF, flux_ratio: float, x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
+    """As `_pairs` for places that are the same turned by 180 degrees, which changes no shape: half of them."""
+    half = len(x) // 2 + 1
+    found = _pairs(psf, flux_ratio, x[:half], y[:half])
+    return {name: np.concatenate([values, values[-2::-1]]) for name, values in found.items()}
+
+
 def _pairs(psf: PSF, flux_ratio: float, x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
     """e1, e2, R² of pairs, each alone, and where they had to be drawn."""
     zero = np.zeros_like(x)
@@ -124,13 +142,12 @@ def _pairs(psf: PSF, flux_ratio: float, x: FloatArray, y: FloatArray) -> dict[st
     each = KernelMoments(values=moments_of_points(pairs.flux, pairs.x, pairs.y), n_stars=1)
     shape = response(psf, Adaptive()).shapes(each, threshold=0.0)
     result = {"e1": shape.e1, "e2": shape.e2, "r2": shape.r2, "by_images": shape.flag != 0}
-    left = np.flatnonzero(shape.flag)
-    for i in left[left <= len(x) // 2].tolist():  # a pair turned by 180 degrees has the same shape
+    for i in np.flatnonzero(shape.flag).tolist():
         drawn = measure_stack(
             psf, Systems.from_pairs(zero[:1] + flux_ratio, x[i : i + 1], y[i : i + 1]), Adaptive()
         )
         for name in ("e1", "e2", "r2"):
-            result[name][[i, len(x) - 1 - i]] = getattr(drawn, name)
+            result[name][i] = getattr(drawn, name)
     return result
 
 
@@ -147,8 +164,8 @@ def headline(maps: xr.Dataset) -> dict[str, Any]:
     numbers : dict
         ``at_0_01``: the largest absolute ``de_rel`` and the largest ``dr2_rel`` for a companion at 0.01 arcsec,
         per magnitude difference; ``radius_of_1_percent`` [arcsec], the least separation at which ``de_rel``
-        reaches 0.01; ``e_depends_on_psf`` and ``r2_depends_on_psf``: largest difference between the maps of the
-        two PSFs, over the largest value (dimensionless).
+        reaches 0.01, NaN where it does not in the pixel; ``e_depends_on_psf`` and ``r2_depends_on_psf``: largest
+        difference between the maps of the two PSFs, over the largest value (dimensionless).
     """
     psfs = [
         sheared_gaussian(str(n), float(a), float(b), maps.attrs["fwhm"])
@@ -167,16 +184,20 @@ def headline(maps: xr.Dataset) -> dict[str, Any]:
             return np.array([max(de), max(dr2)])
 
         at_near = largest(NEAR)
-        low, high = 1e-4, PIXEL / 2
-        for _ in range(16):
-            middle = math.sqrt(low * high)
-            low, high = (low, middle) if largest(middle)[0] > 0.01 else (middle, high)
+
+        def beyond(log_radius: float, largest: Callable[[float], FloatArray] = largest) -> float:
+            return float(largest(math.exp(log_radius))[0] - ONE_PERCENT)
+
+        low, high = math.log(1e-4), math.log(PIXEL / 2)
+        radius = (
+            math.exp(brentq(beyond, low, high, xtol=1e-5)) if beyond(high) > 0 > beyond(low) else math.nan
+        )
         rows.append(
             {
                 "delta_m": dm,
                 "de_rel_at_0_01": float(at_near[0]),
                 "dr2_rel_at_0_01": float(at_near[1]),
-                "radius_of_1_percent": high,
+                "radius_of_1_percent": radius,
             }
         )
 

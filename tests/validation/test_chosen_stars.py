@@ -28,7 +28,7 @@ N_STACKS, N_STARS, SIDE = 100, 400, 33
 PIXEL, MAGNITUDE, FRACTION = 0.04, 20.0, 0.7
 EXPOSURE = replace(EUCLID_VIS_WIDE, pixel=PIXEL, n_exposures=1)
 TABLE = (
-    "12c Stars chosen by their own size, from end to end: 100 stacks of 400 stars of 20 mag behind `psf1` with a pixel "
+    "17 Stars chosen by their own size, from end to end: 100 stacks of 400 stars of 20 mag behind `psf1` with a pixel "
     "of 0.04″, 70 % pairs, one exposure with the noise of Euclid's; drawn with GalSim, measured with HSM, clipped "
     "about the known PSF, stacked, measured again, against the closed form; R² relative; pulls in standard errors"
 )

@@ -20,13 +20,13 @@ from porrima.stack import draw_stacks
 from statistics_helpers import assert_within_sigma
 
 FRACTION = 0.35
-STARS = "12 Stars rejected by their own shape: {}."
+STARS = "16 Stars rejected by their own shape: {}."
 CLIPPED = STARS.format(
     "18 to 19 mag, 35 % pairs, `psf0`, adaptive; ten million stars drawn, measured and clipped one by one against the "
     "closed form, for thresholds of size (`r2`) or of the ellipticity (`e`) and noise sigma at all magnitudes; "
     "pulls in standard errors"
 )
-FACTS = "12b What rejection does without noise: 18 to 19 mag, 35 % pairs, `psf0`, 20 000 stars at l = 180, b = 45."
+FACTS = "16b What rejection does without noise: 18 to 19 mag, 35 % pairs, `psf0`, 20 000 stars at l = 180, b = 45."
 
 
 def population(model, n_drawn=5000):

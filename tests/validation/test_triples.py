@@ -16,15 +16,15 @@ from porrima.systems import Systems
 from statistics_helpers import assert_within_sigma
 
 ENGINE = (
-    "12c Triple stars: 18 to 19 mag at l = 180, b = 45, 1500 stars, 35 % multiple, triples on; stacks of 40 stars by "
+    "18 Triple stars: 18 to 19 mag at l = 180, b = 45, 1500 stars, 35 % multiple, triples on; stacks of 40 stars by "
     "the engine against the quadrature over hierarchies; pulls in standard errors, that of the quadrature included."
 )
 SHAPES = (
-    "12d Shapes of stacks with triples: the same stacks, measured by adaptive moments, against the prediction for 40 "
+    "18b Shapes of stacks with triples: the same stacks, measured by adaptive moments, against the prediction for 40 "
     "stars; bias and standard deviation of R²/R0² and of e1; pulls in standard errors."
 )
 IMAGES = (
-    "12e Systems of three sources against drawn images: each drawn with GalSim where its sources are and measured by "
+    "18c Systems of three sources against drawn images: each drawn with GalSim where its sources are and measured by "
     "its HSM, against shapes from kernel moments; largest difference of e1, e2 and R²/R0² over the size change."
 )
 FRACTION, N_STARS, N_STACKS = 0.35, 40, 200_000
