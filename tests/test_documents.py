@@ -310,6 +310,18 @@ def test_the_budget_table_is_what_budget_gives(monkeypatch, capsys, model):
     assert cells[3].strip() == verdict["verdict"]
 
 
+def test_the_table_of_chosen_stars_is_what_select_gives(monkeypatch, capsys):
+    text = (ROOT / "docs" / "select.md").read_text(encoding="utf-8").split("**Euclid VIS, b = 75°**")[1]
+    cells = [cell.strip() for cell in re.search(r"^\| \*\*best\*\* \|(.*)\|$", text, re.M)[1].split("|")]
+    line = "select --survey euclid-vis --l 180 --b 75 --mag 16 20 --clip 0.004770664608946602 --exposures 4"
+    best = json_of(monkeypatch, capsys, *line.split())["best"]
+    assert cells[0] == f"{best['mag_lo']:g}–{best['mag_hi']:g}"
+    assert cells[1] == f"{100 * best['clip']:.2f} %"
+    shown = [float(cells[3]), float(cells[4].split()[0]), float(cells[6]), float(cells[7])]
+    expected = [best["n_stars"], best["merit"], best["share_r2"], 1e4 * best["binaries_r2"]]
+    assert shown == pytest.approx(expected, rel=0.02)
+
+
 @pytest.mark.parametrize(("name", "pixel"), [("optical1", None), ("roman:H158:SCA01", 0.11)])
 def test_the_table_of_psf_sizes_is_what_predict_gives(monkeypatch, capsys, name, pixel):
     text = (ROOT / "docs" / "budget.md").read_text(encoding="utf-8")
