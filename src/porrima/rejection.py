@@ -107,7 +107,7 @@ def lost_singles(n, loss, key_low, key_high, stack_low, stack_high, draw):  # ty
     """How many of n single stars are rejected, one binomial draw, and the next free draw."""
     if loss == 0.0:
         return 0, draw
-    return binomial(n, loss, key_low, key_high, LOST_STAGE, stack_low, stack_high, draw)
+    return binomial(n, loss, key_low, key_high, uint32(LOST_STAGE), stack_low, stack_high, draw)
 
 
 @njit(_nrt=False)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numba import njit, prange
+from numba import int64, njit, prange, uint32
 
 from porrima.blocks import (
     BLOCK_SIZE,
@@ -228,13 +228,14 @@ def _draw_stack(  # type: ignore[no-untyped-def]
     """
     key_low, key_high = halves(seed)
     low, high = halves(stack)
-    wanted, draw = binomial(n_stars, fraction, key_low, key_high, COUNT_STAGE, low, high, 0)
-    resolved, lost_draw = lost_singles(n_stars - wanted, loss, key_low, key_high, low, high, 0)
+    stage, none = uint32(COUNT_STAGE), int64(0)  # no literals, for each of which functions would be compiled anew
+    wanted, draw = binomial(n_stars, fraction, key_low, key_high, stage, low, high, none)
+    resolved, lost_draw = lost_singles(n_stars - wanted, loss, key_low, key_high, low, high, none)
     n_blocks, kept, total, lane = 0, 0, 0.0, LANES
     while wanted > 0 or resolved > 0:
         if wanted == 0:
             places = resolved
-            wanted, draw = binomial(places, fraction, key_low, key_high, COUNT_STAGE, low, high, draw)
+            wanted, draw = binomial(places, fraction, key_low, key_high, stage, low, high, draw)
             resolved, lost_draw = lost_singles(places - wanted, loss, key_low, key_high, low, high, lost_draw)
             continue
         if lane == LANES:
@@ -289,7 +290,7 @@ def _add_block(weight, member, block, room, sums, listed):  # type: ignore[no-un
 @njit(_nrt=False)
 def _add_singles(tables, screen, key_low, key_high, low, high, n_stars, kept, scale, listed):  # type: ignore[no-untyped-def]
     """Total weight of the single stars of a stack, each listed where `listed` has rows."""
-    total, draw = 0.0, 0
+    total, draw = 0.0, int64(0)
     for single in range(kept, n_stars):
         weight = 1.0
         if tables.weight.size > 0:

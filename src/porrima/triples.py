@@ -92,7 +92,7 @@ def member_rows(population: Population) -> NDArray[np.float32]:
     return rows
 
 
-_step = njit(inline="always", fastmath={"contract"}, error_model="numpy")
+_step = njit(_nrt=False, fastmath={"contract"}, error_model="numpy")
 
 
 @_step

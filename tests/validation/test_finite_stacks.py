@@ -1,5 +1,6 @@
 """Stacks of one to ten thousand stars: the whole covariance and the quantiles of the size error, against simulation."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -40,20 +41,20 @@ def population():
 
 
 @pytest.fixture(scope="module")
-def results():
-    return {}
+def stacks(population, full_size):
+    """Moments of stacks of so many stars, in parts, drawn once."""
 
+    @cache
+    def drawn(n_stars):
+        n_stacks = (200_000 if n_stars < 10_000 else 100_000) // (1 if full_size else 10)
+        run = {"n_stars": n_stars, "binary_fraction": FRACTION, "seed": 20261125}
+        parts = (
+            draw_stacks(population, first=first, last=first + n_stacks // 10, **run)
+            for first in range(0, n_stacks, n_stacks // 10)
+        )
+        return [part.moments for part in parts]
 
-@pytest.fixture(scope="module", params=STARS)
-def stacks(request, population):
-    n_stars = request.param
-    n_stacks = 200_000 if n_stars < 10_000 else 100_000
-    run = {"n_stars": n_stars, "binary_fraction": FRACTION, "seed": 20261125}
-    parts = [
-        draw_stacks(population, first=first, last=first + 20_000, **run)
-        for first in range(0, n_stacks, 20_000)
-    ]
-    return n_stars, [part.moments for part in parts]
+    return drawn
 
 
 def changes(reply, parts):
@@ -113,51 +114,60 @@ def quantiles_of(size, found):
     return np.abs(pull).max(), ends
 
 
+@pytest.fixture(scope="module")
+def compared(population, stacks):
+    """Pulls of stacks of so many stars, what is predicted of them, and what the figure shows of them."""
+
+    @cache
+    def of(psf, estimator, n_stars):
+        integrals = integrate(population)
+        moments = population_moments(population, integrals, np.array([FRACTION]))
+        reply = response(psf_from_name(psf), estimator_from_name(estimator))
+        change = changes(reply, stacks(n_stars))
+        assert np.all(np.isfinite(change))
+        distribution = size_distribution(population, reply, n_stars, FRACTION, integrals)
+        found = predict(moments, reply, n_stars)
+        pulls, sd, sd_se = pulls_of(change, found)
+        pull, ends = quantiles_of(change[2], distribution)
+        first = first_order(moments, reply) / np.sqrt(n_stars)
+        shown = {
+            "ratio": sd / first, "ratio_se": sd_se / first,
+            "quantile_lo": ends[0], "quantile": ends[1], "quantile_hi": ends[2],
+        }  # fmt: skip
+        return pulls, pull, [f"{found.sd[k, 0] / first[k]:.3f}" for k in (2, 0)], shown
+
+    return of
+
+
+@pytest.mark.parametrize("n_stars", STARS)
 @pytest.mark.parametrize(("psf", "estimator"), CASES)
-def test_covariance_and_quantiles_of_stacks(population, results, record, stacks, psf, estimator):
-    n_stars, parts = stacks
-    integrals = integrate(population)
-    moments = population_moments(population, integrals, np.array([FRACTION]))
-    reply = response(psf_from_name(psf), estimator_from_name(estimator))
-    change = changes(reply, parts)
-    assert np.all(np.isfinite(change))
-    distribution = size_distribution(population, reply, n_stars, FRACTION, integrals)
-    found = predict(moments, reply, n_stars)
-    pulls, sd, sd_se = pulls_of(change, found)
-    pull, ends = quantiles_of(change[2], distribution)
-    first = first_order(moments, reply) / np.sqrt(n_stars)
-    results[f"{psf}, {estimator}", n_stars] = {
-        "ratio": sd / first, "ratio_se": sd_se / first,
-        "quantile_lo": ends[0], "quantile": ends[1], "quantile_hi": ends[2],
-    }  # fmt: skip
+def test_covariance_and_quantiles_of_stacks(compared, record, n_stars, psf, estimator):
+    pulls, pull, ratios, _ = compared(psf, estimator, n_stars)
     columns = ["stars", "PSF", "estimator", "bias", "covariance", "with ln R²", "quantiles", "sd R²", "sd e1"]
-    ratios = [f"{found.sd[k, 0] / first[k]:.3f}" for k in (2, 0)]
     record(SCATTER, columns, [n_stars, psf, estimator, *(f"{p:.1f}" for p in [*pulls, pull]), *ratios])
     assert max(pulls) < 5
     assert pull < 5
 
 
-def test_the_figure_of_scatter_and_quantiles(request, population, results, tmp_path):
-    cases = [f"{psf}, {estimator}" for psf, estimator in CASES]
-    if len(results) < len(cases) * len(STARS):
-        pytest.fail("the figure needs the results of the tests before it")
+def test_the_figure_of_scatter_and_quantiles(full_size, population, compared, tmp_path):
+    shown = [[compared(psf, estimator, n)[3] for n in STARS] for psf, estimator in CASES]
     variables = {
         name: (
             ("case", "quantity" if name[:5] == "ratio" else "probability", "n_stars"),
-            np.stack([np.stack([results[c, n][name] for n in STARS], axis=-1) for c in cases]),
+            np.stack([np.stack([one[name] for one in row], axis=-1) for row in shown]),
         )
-        for name in results[cases[0], 1]
+        for name in shown[0][0]
     }
     n_line, predicted = lines(population)
     variables |= predicted
     coords = {
-        "case": cases,
+        "case": [f"{psf}, {estimator}" for psf, estimator in CASES],
         "n_stars": list(STARS),
         "n_line": n_line,
         "quantity": list(QUANTITIES),
         "probability": PROBABILITIES,
     }
     figure = scatter_of_stacks(xr.Dataset(variables, coords=coords))
-    path = PICTURE if request.config.getoption("--write-validation") else tmp_path / "scatter.png"
+    path = PICTURE if full_size else tmp_path / "scatter.png"
     figure.savefig(path, dpi=130)
     assert path.stat().st_size > 1e4

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ import numpy as np
 import psutil
 import pytest
 
-N_STACKS, CHUNK, KILLS = 40_000, 100, 20
+CHUNK, KILLS = 100, 20
 CONFIG = "stars: {{l: 180, b: 45, mag: [18, 19], n_drawn: 2000}}\nn_stacks: {}\nn_stars: {}\n"
 KILLED = (
     "20 Interruptions: `porrima simulate` of 40 000 stacks in chunks of 100, each process killed with SIGKILL at a "
@@ -60,10 +59,10 @@ def wait_for(n, path, process):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """Folder with a configuration and the store of an uninterrupted run, and the time to its first chunk."""
-    folder = tmp_path_factory.mktemp("whole")
-    (folder / "run.yaml").write_text(CONFIG.format(N_STACKS, 40))
+def whole(tmp_path_factory, full_size):
+    """Folder with a configuration and the store of a whole run, its stacks, and the time to its first chunk."""
+    folder, n_stacks = tmp_path_factory.mktemp("whole"), 40_000 if full_size else 16_000
+    (folder / "run.yaml").write_text(CONFIG.format(n_stacks, 40))
     done(command("simulate", folder / "run.yaml", "-o", folder / "first.zarr", "--chunk", CHUNK))  # compiles
     start = time.monotonic()
     path = folder / "run.zarr"
@@ -72,11 +71,11 @@ def whole(tmp_path_factory):
     first = time.monotonic() - start
     done(process)
     assert contents(path) == contents(folder / "first.zarr")
-    return folder, first
+    return folder, n_stacks, first
 
 
 def test_kills_at_random_moments_of_a_run_change_no_byte(whole, full_size, tmp_path, record):
-    (folder, first), kills = whole, KILLS if full_size else KILLS // 4
+    (folder, n_stacks, first), kills = whole, KILLS if full_size else KILLS // 4
     path, rng = tmp_path / "run.zarr", np.random.Generator(np.random.Philox(20261123))
     lost, at_work = [], 0
     for _ in range(kills):
@@ -95,7 +94,7 @@ def test_kills_at_random_moments_of_a_run_change_no_byte(whole, full_size, tmp_p
         at_work += len(written) > before
     left = done(command("simulate", folder / "run.yaml", "-o", path, "--resume"))["n_stacks_computed"]
     assert max(lost) <= 1
-    assert 0 < left < N_STACKS
+    assert 0 < left < n_stacks
     assert contents(path) == contents(folder / "run.zarr")
     columns = [
         "killed",
@@ -108,10 +107,14 @@ def test_kills_at_random_moments_of_a_run_change_no_byte(whole, full_size, tmp_p
 
 
 def test_killed_workers_and_a_killed_client_change_no_byte(whole, tmp_path, record):
-    folder, _ = whole
+    folder, n_stacks, _ = whole
     path, rng, kills = tmp_path / "run.zarr", np.random.Generator(np.random.Philox(20261124)), 0
     arguments = ("simulate", folder / "run.yaml", "-o", path, "--resume", "--workers", 2, "--chunk", CHUNK)
-    for end in (40, 200, N_STACKS):  # chunks after which the client itself is killed; the last time it is not
+    for end in (
+        n_stacks // 1000,
+        n_stacks // 200,
+        n_stacks,
+    ):  # chunks after which the client itself is killed; the last time it is not
         process, before = command(*arguments, start_new_session=True), len(chunks(path, "tally"))
         while process.poll() is None and len(chunks(path, "tally")) < end:
             time.sleep(rng.uniform(0, 2))
@@ -121,7 +124,7 @@ def test_killed_workers_and_a_killed_client_change_no_byte(whole, tmp_path, reco
             if len(workers) == 2 and len(chunks(path, "tally")) > before and kills < 8:
                 os.kill(rng.choice([p.pid for p in workers]), signal.SIGKILL)
                 kills += 1
-        if end < N_STACKS:
+        if end < n_stacks:
             process.kill()
             process.communicate()
     done(process)
@@ -145,13 +148,13 @@ def peak(*arguments):
     return int(re.search(r"VmHWM:\s*(\d+) kB", err)[1]) / 1024
 
 
-def test_memory_does_not_grow_with_the_number_of_stacks(tmp_path, record):
-    peaks = {}
-    for n_stacks in (100_000, 1_000_000):
+def test_memory_does_not_grow_with_the_number_of_stacks(tmp_path, full_size, record):
+    file, peaks = tmp_path / "first.yaml", {}
+    file.write_text(CONFIG.format(1000, 40))
+    done(command("simulate", file, "-o", tmp_path / "first.zarr"))  # compiles
+    for n_stacks in (100_000, 1_000_000) if full_size else (40_000, 400_000):
         file, path = tmp_path / f"{n_stacks}.yaml", tmp_path / f"{n_stacks}.zarr"
         file.write_text(CONFIG.format(n_stacks, 40))
-        done(command("simulate", file, "-o", tmp_path / "first.zarr", "--resume"))  # compiles
-        shutil.rmtree(tmp_path / "first.zarr")
         peaks[n_stacks] = {
             "simulate": peak("simulate", file, "-o", path),
             "summary --bins 20": peak("summary", path, "--bins", 20),
@@ -159,7 +162,7 @@ def test_memory_does_not_grow_with_the_number_of_stacks(tmp_path, record):
         }
     few, many = peaks.values()
     for name in few:
-        columns = ["command", "100 000 stacks [MB]", "1 000 000 stacks [MB]"]
+        columns = ["command", *(f"{n:,} stacks [MB]".replace(",", " ") for n in peaks)]
         record(MEMORY, columns, [name, f"{few[name]:.0f}", f"{many[name]:.0f}"])
         assert many[name] < MEMORY_LIMIT
         assert many[name] < few[name] + 50
