@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
-__all__ = [
-    "SHARP", "Combined", "HardCut", "Layer", "Selection", "SelectionTable", "probability_layer", "read_selection",
-]  # fmt: skip
+__all__ = ["SHARP", "Combined", "Layer", "Selection", "SelectionTable", "probability_layer", "read_selection"]
 
 SHARP = 1e-6
 """Relative width of an edge that has none of its own (dimensionless)."""
@@ -96,53 +94,6 @@ def probability_layer(
     """
     m, f, r = np.meshgrid(magnitude, flux_ratio, separation, indexing="ij")
     return Layer(score=selection.rejected(r, f, m), normal=False)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HardCut:
-    """Pairs at or beyond a separation are recognised, all others and single stars kept.
-
-    Parameters
-    ----------
-    separation : float
-        In arcsec, positive.
-    """
-
-    separation: float
-
-    def rejected(self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray) -> FloatArray:
-        """Probability to be rejected.
-
-        Parameters
-        ----------
-        separation, flux_ratio, magnitude : (n,) float array
-            In arcsec, dimensionless and mag; the last two play no part.
-
-        Returns
-        -------
-        probability : (n,) float array
-            0 or 1, in [0, 1].
-        """
-        beyond, _, _ = np.broadcast_arrays(separation >= self.separation, flux_ratio, magnitude)
-        return beyond.astype(float)
-
-    def layers(
-        self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray
-    ) -> tuple[Layer, ...]:
-        """The edge on a grid.
-
-        Parameters
-        ----------
-        separation, flux_ratio, magnitude : (n_r,), (n_f,), (n_m,) float array
-            In arcsec, dimensionless and mag.
-
-        Returns
-        -------
-        layers : tuple of Layer
-            One, dimensionless.
-        """
-        score = ((separation / self.separation) ** 2 - 1) / SHARP
-        return (Layer(score=np.tile(score, (1, flux_ratio.size, 1)), normal=True),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
