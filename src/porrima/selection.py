@@ -13,7 +13,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from porrima.errors import InputError
-from porrima.tables import column_values, load_table, open_catalog
+from porrima.rows import refuse_unless
+from porrima.tables import load_table, named_columns, open_catalog
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,6 +30,10 @@ SHARP = 1e-6
 """Relative width of an edge that has none of its own (dimensionless)."""
 
 _AXES = ("magnitude", "contrast", "separation")
+_OWN = {  # how a table may say how bright companions are: unit, rule and largest value
+    "contrast": ("mag", "must be from 0 to 30 mag", 30.0),
+    "flux_ratio": ("", "must be in [0, 1]", 1.0),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,33 +280,20 @@ def read_selection(path: Path) -> SelectionTable:
         If a column is missing, a value breaks its rule, or the grid has gaps: names row or column.
     """
     table, row = load_table(open_catalog(path, {}, None))
-    own = "contrast" if "contrast" in table.colnames else "flux_ratio"
-    units = {"separation": "arcsec", own: "mag" if own == "contrast" else "", "probability": ""}
-    values = {}
-    for name, unit in (units | {"magnitude": "mag"}).items():
-        if name in table.colnames:
-            values[name] = column_values(path, table[name], name, unit, row)
-        elif name != "magnitude":
-            names = ", ".join(table.colnames)
-            wanted = "contrast or flux_ratio" if name == own else name
-            raise InputError(f"is missing; the table has {names}", source=path, column=wanted)
-    if not len(table):
-        raise InputError("must have rows below its header", source=path)
+    own = next((name for name in _OWN if name in table.colnames), " or ".join(_OWN))
+    unit, rule, largest = _OWN.get(own, _OWN["contrast"])
+    needed = {"separation": "arcsec", own: unit, "probability": ""}
+    values = named_columns(path, table, row, needed, {"magnitude": "mag"})
     values.setdefault("magnitude", np.zeros(len(table)))
     _refuse_dimensional(path, table, own)
     r, p, m, c = (values[name] for name in ("separation", "probability", "magnitude", own))
-    good = {
-        "separation": ("must be from 0 to 10 arcsec", (r >= 0) & (r <= 10)),
-        own: ("must be from 0 to 30 mag", (c >= 0) & (c <= 30))
-        if own == "contrast"
-        else ("must be in [0, 1]", (c >= 0) & (c <= 1)),
-        "magnitude": ("must be finite", np.isfinite(m)),
-        "probability": ("must be in [0, 1]", (p >= 0) & (p <= 1)),
-    }
-    for name, (rule, fine) in good.items():
-        if not np.all(fine):
-            k = int(np.argmin(fine))
-            raise InputError(rule, source=path, row=int(row[k]), column=name, value=values[name][k])
+    rules = [
+        ("separation", "must be from 0 to 10 arcsec", (r >= 0) & (r <= 10)),
+        (own, rule, (c >= 0) & (c <= largest)),
+        ("magnitude", "must be finite", np.isfinite(m)),
+        ("probability", "must be in [0, 1]", (p >= 0) & (p <= 1)),
+    ]
+    refuse_unless(path, row, values, rules)
     single = (r == 0) | ((c == 0) & (own == "flux_ratio"))
     contrast = c if own == "contrast" else -2.5 * np.log10(np.where(single, 1.0, c)) + 0.0
     return _gridded(path, {"separation": r, "contrast": contrast, "magnitude": m}, p, row, single)
