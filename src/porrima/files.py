@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-__all__ = ["make_folder", "plain", "write_json", "write_table", "write_whole"]
+__all__ = ["json_ready", "make_folder", "write_json", "write_table", "write_whole"]
 
 
 def make_folder(path: Path) -> None:
@@ -108,11 +108,11 @@ def write_json(value: Any, path: Path) -> None:
     None
         The result is the file.
     """
-    text = json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(json_ready(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     write_whole(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
 
 
-def plain(value: Any) -> Any:
+def json_ready(value: Any) -> Any:
     """A result as JSON has it.
 
     Parameters
@@ -126,9 +126,9 @@ def plain(value: Any) -> Any:
         The same without numpy's floats, and with null for what is not a finite number.
     """
     if isinstance(value, dict):
-        return {key: plain(inner) for key, inner in value.items()}
+        return {key: json_ready(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(inner) for inner in value]
+        return [json_ready(inner) for inner in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -161,7 +162,7 @@ def write_rows_and_figure(
     Parameters
     ----------
     rows : sequence of dict
-        As `write_rows` takes them.
+        As `write_rows` takes them; where one has None there is NaN in the file.
     table, picture : Path or None
         Files to write; none where not given.
     draw : callable
@@ -185,6 +186,7 @@ def write_rows_and_figure(
         if path is not None and not path.parent.is_dir():
             raise InputError("cannot be written (No such folder)", key="output", value=path)
     if table is not None:
-        write_rows(rows, table, made_with)
+        known = [{key: math.nan if value is None else value for key, value in row.items()} for row in rows]
+        write_rows(known, table, made_with)
     if picture is not None:
         write_figure(draw(), picture)

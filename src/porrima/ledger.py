@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from porrima.galaxies import Galaxies
     from porrima.shares import Interval, MagnitudeBin, Share
 
-__all__ = ["BUDGET_COLUMNS", "budget_answer", "budget_lines", "header_of", "write_budget"]
+__all__ = ["BUDGET_COLUMNS", "budget_answer", "budget_header", "budget_lines", "write_budget"]
 
 _FEWEST_DIGITS = 1e-12  # a bias below it is the rounding of 0
 
@@ -163,7 +163,7 @@ def _percent(share: Share | None) -> str:
     return f"{bias:.0f} / {share.total.value * of:.0f} %"
 
 
-def header_of(answer: dict[str, Any], multiplicity: str) -> str:
+def budget_header(answer: dict[str, Any], multiplicity: str) -> str:
     """Lines above the table on the terminal.
 
     Parameters
@@ -225,9 +225,5 @@ def write_budget(answer: dict[str, Any], table: Path | None, picture: Path | Non
 
         return budget_shares(answer)
 
-    empty = {"required": math.nan, "verdict": ""}
-    rows = [
-        {key: empty.get(key, math.nan) if value is None else value for key, value in row.items()}
-        for row in answer["shares"]
-    ]
+    rows = [row | {"verdict": row["verdict"] or ""} for row in answer["shares"]]
     write_rows_and_figure(rows, table, draw, picture)

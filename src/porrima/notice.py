@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 from porrima.errors import InputError
@@ -163,7 +162,6 @@ def write_advice(answer: dict[str, Any], folder: Path | None) -> None:
     if folder is None:
         return
     make_folder(folder)
-    rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in answer["settings"]]
     made_with = {key: value for key, value in answer.items() if not isinstance(value, list)}
-    write_rows_and_figure(rows, folder / "select.ecsv", draw, folder / "select.png", made_with)
+    write_rows_and_figure(answer["settings"], folder / "select.ecsv", draw, folder / "select.png", made_with)
     write_json(answer, folder / "select.json")

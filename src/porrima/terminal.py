@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-from porrima.files import plain
+from porrima.files import json_ready
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -150,7 +150,7 @@ def show(
         It goes to standard output.
     """
     if as_json:
-        print(json.dumps(plain(result), allow_nan=False))
+        print(json.dumps(json_ready(result), allow_nan=False))
         return
     grid = Table(
         *(Column(Text(column)) for column in columns), box=box.SIMPLE_HEAD
