@@ -224,8 +224,6 @@ def decided(
     """
     if n_stars < 1:
         raise InputError("must be at least 1", key="--n-stars", value=n_stars)
-    if binary_fraction is not None and not 0 <= binary_fraction <= 1:
-        raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     survey, requirement = survey_of(instrument, requirements)
     sizes, ranges = galaxies_of(galaxy_size, galaxies), magnitude_bins(mag, bins, step)
     config = population_config(**options, mag=mag, cut=survey.cut if cut is None else cut)
