@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hard_cut import HardCut
 from porrima.clip import Clip, Noise
 from porrima.clipping import clip_curve, count_pairs
 from porrima.errors import InputError
@@ -13,7 +14,6 @@ from porrima.photometry import PHOTOMETRY
 from porrima.prediction import integrate, population_moments
 from porrima.psf import psf_from_name
 from porrima.response import response
-from porrima.selection import HardCut
 from porrima.shapes import Adaptive, Plain
 from porrima.systems import Population
 

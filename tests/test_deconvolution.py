@@ -50,20 +50,23 @@ def test_galaxies_much_larger_than_the_psf_weigh_their_middle(mean_e2):
     assert found.kappa_c == pytest.approx(limit, rel=2e-3)
 
 
+def c_of_size(psf, galaxies):
+    """c1 and c2 over <x> <1/R_gal²>, for r → 0."""
+    found = fit_response(psf, galaxies)
+    return (found.first[1:, SECOND[0]] + found.first[1:, SECOND[2]]) / (2 * found.inverse_r2)
+
+
 def test_round_psf_gives_no_c_and_a_long_one_gives_c_along_it():
     galaxies = Galaxies.sersic(0.1, 1.0)
-    round_c = fit_response(psf_from_name("psf0"), galaxies).c_of_size
-    np.testing.assert_allclose(round_c, 0, atol=1e-10)
-    c1, c2 = fit_response(psf_from_name("psf1"), galaxies).c_of_size
+    np.testing.assert_allclose(c_of_size(psf_from_name("psf0"), galaxies), 0, atol=1e-10)
+    c1, c2 = c_of_size(psf_from_name("psf1"), galaxies)
     assert 0 < c1 < 0.054 / 4
     assert c2 / c1 == pytest.approx(-0.003 / 0.054, rel=1e-3)
 
 
 def test_turning_the_psf_by_45_degrees_turns_c():
     galaxies = Galaxies.sersic(0.1, 1.0)
-    along, across = (
-        fit_response(sheared_gaussian("turned", *e), galaxies).c_of_size for e in ((0.05, 0.0), (0.0, 0.05))
-    )
+    along, across = (c_of_size(sheared_gaussian("turned", *e), galaxies) for e in ((0.05, 0.0), (0.0, 0.05)))
     np.testing.assert_allclose(across, [-along[1], along[0]], atol=1e-7)
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hard_cut import HardCut
 from porrima.distribution import size_distribution
 from porrima.errors import InputError
 from porrima.multiplicity import MULTIPLICITY
@@ -14,7 +15,7 @@ from porrima.psf import psf_from_name
 from porrima.rejection import single_loss
 from porrima.response import response
 from porrima.screen import screen_of
-from porrima.selection import Combined, HardCut, SelectionTable
+from porrima.selection import Combined, SelectionTable
 from porrima.shapes import Plain
 from porrima.stack import draw_stacks, draw_systems
 from porrima.systems import Population

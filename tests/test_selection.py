@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hard_cut import HardCut
 from porrima.errors import InputError
 from porrima.prediction import integrate, population_moments
 from porrima.screen import FOUR_Y, SQUARE, flux_ratio_of, kept_share, magnitude_nodes, screen_of
-from porrima.selection import Combined, HardCut, SelectionTable, read_selection
+from porrima.selection import Combined, SelectionTable, read_selection
 
 HEADER = "separation,contrast,magnitude,probability\n"
 ROWS = [(r, c, m, 0.1 * k) for k, (r, c, m) in enumerate(

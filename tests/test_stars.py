@@ -75,6 +75,15 @@ def test_mass_ratios_follow_their_stars():
     assert three().select(mass_max=1.0).mass_ratio is None
 
 
+def test_some_stars_taken_evenly_are_of_all_masses_and_distances():
+    mass, distance = np.repeat([0.1, 0.4, 1.0], 4), np.tile([4.0, 1.0, 3.0, 2.0], 3)
+    stars = Stars.from_columns(mass=mass, distance=distance, magnitude=np.full(12, 18.0))
+    some = stars.evenly(6)
+    assert some.mass.tolist() == [0.1, 0.1, 0.4, 0.4, 1.0, 1.0]
+    assert some.distance.tolist() == [2.0, 4.0] * 3
+    assert sorted(stars.evenly(12).distance) == sorted(distance)
+
+
 def test_quantities_are_taken_in_any_unit():
     stars = three(mass=np.array([0.3, 0.8, 1.5]) * u.solMass, distance=np.array([0.1, 0.9, 3.0]) * u.kpc)
     np.testing.assert_allclose(stars.distance, three().distance)

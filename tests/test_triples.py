@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from hard_cut import HardCut
 from porrima import triple_averages
 from porrima.averages import population_moments
 from porrima.clipping import count_pairs
@@ -23,7 +24,6 @@ from porrima.prediction import predict
 from porrima.psf import psf_from_name
 from porrima.published import Offner2023
 from porrima.response import response
-from porrima.selection import HardCut
 from porrima.shapes import Adaptive, estimator_from_name
 from porrima.stack import draw_stacks, draw_systems
 from porrima.stars import Stars

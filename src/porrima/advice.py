@@ -131,8 +131,6 @@ def advised(
         requirement=requirement, area=_positive("--patch-area", patch_area, taken.area, "deg²"),
         exposures=_exposures(exposures, taken), threshold=_thresholds(clip), independent=independent, **names,
     )  # fmt: skip
-    if binary_fraction is not None and not 0 <= binary_fraction <= 1:
-        raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     sizes, ranges = galaxies_of(galaxy_size, galaxies), _unsaturated(magnitude_bins(mag, bins, step), taken)
     options |= {"band": options.get("band") or (taken.band if options.get("catalog") is None else None)}
     config = population_config(**options, mag=mag, cut=own.cut if cut is None else cut)

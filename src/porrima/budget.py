@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-__all__ = ["CUTS", "Budget", "Setting", "budget"]
+__all__ = ["CUTS", "Budget", "Premises", "budget"]
 
 FEW_STARS = 40
 """Number of stars below which the scatter does not quite fall with the root of their number (count)."""
@@ -56,7 +56,7 @@ _ROUNDS = 8  # at most, until the number of stars no longer moves
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Setting:
+class Premises:
     """What a budget is made for.
 
     Parameters
@@ -101,13 +101,13 @@ class Budget:
 
     Parameters
     ----------
-    setting : Setting
+    premises : Premises
         What they are made for.
     bins : tuple of MagnitudeBin
         In order.
     """
 
-    setting: Setting
+    premises: Premises
     bins: tuple[MagnitudeBin, ...]
 
     @property
@@ -139,12 +139,12 @@ class Budget:
         return out
 
 
-def budget(setting: Setting, bins: Sequence[tuple[tuple[float, float], Stars]]) -> Budget:
+def budget(premises: Premises, bins: Sequence[tuple[tuple[float, float], Stars]]) -> Budget:
     r"""Share of each requirement that unresolved binaries use, by magnitude.
 
     Parameters
     ----------
-    setting : Setting
+    premises : Premises
         Requirement, PSF, stars in a patch, companions, galaxies.
     bins : sequence of ((float, float), Stars)
         Half-open ranges in mag, with the stars in them.
@@ -179,36 +179,36 @@ def budget(setting: Setting, bins: Sequence[tuple[tuple[float, float], Stars]]) 
     ----------
     KCM16
     """
-    return Budget(setting=setting, bins=tuple(_of_bin(setting, mag, stars) for mag, stars in bins))
+    return Budget(premises=premises, bins=tuple(_of_bin(premises, mag, stars) for mag, stars in bins))
 
 
-def _of_bin(setting: Setting, magnitude: tuple[float, float], stars: Stars) -> MagnitudeBin:
+def _of_bin(premises: Premises, magnitude: tuple[float, float], stars: Stars) -> MagnitudeBin:
     population = Population.of(
-        stars, multiplicity=setting.multiplicity, photometry=setting.photometry, cut=setting.cut,
-        selection=setting.selection,
+        stars, multiplicity=premises.multiplicity, photometry=premises.photometry, cut=premises.cut,
+        selection=premises.selection,
     )  # fmt: skip
     integrals = integrate(population)
     known = uncertainty(
         stars,
-        setting.response,
-        multiplicity=setting.multiplicity,
-        photometry=setting.photometry,
-        cut=setting.cut,
-        binary_fraction=setting.binary_fraction,
-        n_stars=setting.n_stars,
+        premises.response,
+        multiplicity=premises.multiplicity,
+        photometry=premises.photometry,
+        cut=premises.cut,
+        binary_fraction=premises.binary_fraction,
+        n_stars=premises.n_stars,
         integrals=integrals,
-        selection=setting.selection,
+        selection=premises.selection,
     )
     if np.any(np.isnan(known.prediction.bias)):
         rule = (
             "is too wide for the kernel moments of this PSF, whose expansion stops being good at order "
             f"{known.prediction.last_order[0]}"
         )
-        raise InputError(rule, key="cut", value=setting.cut)
-    long = predict(known.prediction.population, setting.response, MANY_STARS)
-    now, later = _changes(setting, known.prediction), _changes(setting, long)
+        raise InputError(rule, key="cut", value=premises.cut)
+    long = predict(known.prediction.population, premises.response, MANY_STARS)
+    now, later = _changes(premises, known.prediction), _changes(premises, long)
     shares = tuple(
-        _share(setting, known, group, k, now[group][:, k, 0], later[group][:, k, 0])
+        _share(premises, known, group, k, now[group][:, k, 0], later[group][:, k, 0])
         for group in now
         for k in range(3)
     )
@@ -217,26 +217,26 @@ def _of_bin(setting: Setting, magnitude: tuple[float, float], stars: Stars) -> M
         n_catalog_stars=len(stars),
         uncertainty=known,
         shares=shares,
-        widest_cut=_widest_cuts(setting, stars, population, integrals, shares),
+        widest_cut=_widest_cuts(premises, stars, population, integrals, shares),
     )
 
 
-def _changes(setting: Setting, prediction: Prediction) -> dict[str, FloatArray]:
+def _changes(premises: Premises, prediction: Prediction) -> dict[str, FloatArray]:
     """Bias and scatter of the quantities of each group, (2, 3, k)."""
     out = {"psf": np.stack([prediction.bias, prediction.sd])}
     found = {}
-    if setting.fit is not None:
-        found["fit"] = deconvolution_bias(prediction.population, setting.fit, prediction.n_stars)
-    if setting.seen is not None:
+    if premises.fit is not None:
+        found["fit"] = deconvolution_bias(prediction.population, premises.fit, prediction.n_stars)
+    if premises.seen is not None:
         covariance = prediction.log_covariance.transpose(2, 0, 1)
-        found["moments"] = moments_bias(prediction.bias, covariance, setting.response.shape0, setting.seen)
+        found["moments"] = moments_bias(prediction.bias, covariance, premises.response.shape0, premises.seen)
     for group, shear in found.items():
         out[group] = np.array([[shear.m, shear.c1, shear.c2], [shear.sd_m, shear.sd_c1, shear.sd_c2]])
     return out
 
 
 def _share(
-    setting: Setting, known: Uncertainty, group: str, k: int, now: FloatArray, later: FloatArray
+    premises: Premises, known: Uncertainty, group: str, k: int, now: FloatArray, later: FloatArray
 ) -> Share:
     """One quantity: bias and scatter (2,) for the stars of a patch, and for many."""
     quantity = GROUPS[group][k]
@@ -250,13 +250,13 @@ def _share(
     total = Interval(*(math.hypot(b, s) for b, s in zip(bias.size, scatter, strict=True)))
     if group == "psf":
         total = _in_proportion(total.value, known, f"sigma_{quantity}").size
-    required = setting.requirement.of(quantity)
+    required = premises.requirement.of(quantity)
     n_stars = Interval(math.nan, math.nan, math.nan)
     if required is not None:
         spread = _in_proportion(float(later[1]) * math.sqrt(MANY_STARS), known, scatter_from).size
         size = _in_proportion(float(later[0]), known, bias_from).size
         n = Interval(*(stars_needed(b, s, required) for b, s in zip(size, spread, strict=True)))
-        n_stars = n._replace(value=_refined(setting, known, group, k, n.value, required))
+        n_stars = n._replace(value=_refined(premises, known, group, k, n.value, required))
     return Share(
         group=group,
         quantity=quantity,
@@ -278,14 +278,14 @@ def _in_proportion(value: float, known: Uncertainty, name: str) -> Interval:
 
 
 def _refined(
-    setting: Setting, known: Uncertainty, group: str, k: int, n_stars: float, required: float
+    premises: Premises, known: Uncertainty, group: str, k: int, n_stars: float, required: float
 ) -> float:
     """Number of stars found again with their own prediction, where they are few."""
     if group != "psf" or n_stars >= FEW_STARS:  # m and c fall with the root, of fits exactly
         return n_stars
     for _ in range(_ROUNDS):
-        prediction = predict(known.prediction.population, setting.response, int(n_stars))
-        bias, scatter = _changes(setting, prediction)[group][:, k, 0].tolist()
+        prediction = predict(known.prediction.population, premises.response, int(n_stars))
+        bias, scatter = _changes(premises, prediction)[group][:, k, 0].tolist()
         better = stars_needed(bias, scatter * math.sqrt(n_stars), required)
         if better == n_stars or math.isinf(better):
             return better
@@ -294,7 +294,7 @@ def _refined(
 
 
 def _widest_cuts(
-    setting: Setting,
+    premises: Premises,
     stars: Stars,
     population: Population,
     integrals: PairIntegrals,
@@ -302,20 +302,20 @@ def _widest_cuts(
 ) -> dict[str, float]:
     """Widest cut that meets the requirements of each group, between cuts that are tried, linear in logarithms."""
     required = [s for s in shares if s.required is not None]
-    if setting.selection is not None:
+    if premises.selection is not None:
         return dict.fromkeys((s.group for s in required), math.nan)
     step = math.ceil(len(stars) / MOST_STARS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MassRangeWarning)
         some = Population.of(
             stars.take(np.arange(0, len(stars), step)),
-            multiplicity=setting.multiplicity,
-            photometry=setting.photometry,
-            cut=setting.cut,
+            multiplicity=premises.multiplicity,
+            photometry=premises.photometry,
+            cut=premises.cut,
         )
     coefficient = integrals.coefficient[:, population.law.star % step == 0]
     totals = np.array(
-        [_totals(setting, replace(some, cut=setting.cut * f), coefficient, required) for f in CUTS]
+        [_totals(premises, replace(some, cut=premises.cut * f), coefficient, required) for f in CUTS]
     )
     now = totals[CUTS.index(1.0)]
     scale = [s.total.value / (s.required or math.inf) for s in required]
@@ -323,23 +323,23 @@ def _widest_cuts(
     out = {}
     for group in dict.fromkeys(s.group for s in required):
         share = used[:, [s.group == group for s in required]].max(axis=1)
-        out[group] = setting.cut * _crossing(np.array(CUTS), share)
+        out[group] = premises.cut * _crossing(np.array(CUTS), share)
     return out
 
 
 def _totals(
-    setting: Setting, population: Population, coefficient: FloatArray, required: list[Share]
+    premises: Premises, population: Population, coefficient: FloatArray, required: list[Share]
 ) -> list[float]:
     """Rms errors of the quantities of which something is required, with another cut; NaN where there are none."""
     integrals = PairIntegrals(
         cut=population.cut, coefficient=coefficient, separation=separation_moments(population, is_rough=True)
     )
-    fraction = None if setting.binary_fraction is None else np.array([setting.binary_fraction])
+    fraction = None if premises.binary_fraction is None else np.array([premises.binary_fraction])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SeriesWarning)
-        long = predict(population_moments(population, integrals, fraction), setting.response, MANY_STARS)
-    bias_and_sd = _changes(setting, long)
-    fewer = math.sqrt(MANY_STARS / setting.n_stars)
+        long = predict(population_moments(population, integrals, fraction), premises.response, MANY_STARS)
+    bias_and_sd = _changes(premises, long)
+    fewer = math.sqrt(MANY_STARS / premises.n_stars)
     found = [bias_and_sd[s.group][:, GROUPS[s.group].index(s.quantity), 0].tolist() for s in required]
     return [math.hypot(bias, fewer * scatter) for bias, scatter in found]
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from porrima.figures import COLOURS, STYLE
+from porrima.figures import COLOURS, RED, STYLE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 __all__ = ["choice_panels"]
 
-_RED = "#b00020"
 _PARTS = (
     ("binaries", "bias by companions", COLOURS[1], "-"),
     ("clip_bias", "bias by the clip of noise", COLOURS[4], "-"),
@@ -106,7 +105,7 @@ def _merits(figure: Figure, axis: Any, answer: dict[str, Any]) -> None:
         best["mag_hi"],
         marker="*",
         markersize=12,
-        color=_RED,
+        color=RED,
         markeredgecolor="white",
     )
     axis.set_yticks(faint)
@@ -137,7 +136,7 @@ def _parts(axis: Any, answer: dict[str, Any], quantity: str) -> None:
         axis.plot(place, total, color="black", linewidth=1.6, label="all")
     axis.axvline(_percent(answer["best"]["clip"], loosest), color="0.6", linewidth=0.8, linestyle=":")
     if required is not None:
-        axis.axhline(1.0, color=_RED, linestyle=":", linewidth=1.2)
+        axis.axhline(1.0, color=RED, linestyle=":", linewidth=1.2)
     axis.set_yscale("log")
     axis.set_ylim(3e-3 * max(total), 3 * max(total))
     name = {"r2": "$R^2$", "e1": "$e_1$", "e2": "$e_2$"}[quantity]
@@ -154,7 +153,7 @@ def _advice(axis: Any, answer: dict[str, Any]) -> None:
     best = answer["best"]
     rows = [("best", best), *((row["advice"], row) for row in answer["runners_up"])]
     for k, (_, row) in enumerate(rows):
-        colour = _RED if not k else COLOURS[0]
+        colour = RED if not k else COLOURS[0]
         axis.barh(-k, row["merit"], color=colour, alpha=0.75, height=0.62)
         clip = "no clip" if row["clip"] is None else f"{100 * row['clip']:.2g} %"
         what = f"{row['mag_lo']:g}–{row['mag_hi']:g} mag, {clip}, {row['n_stars']:.0f} stars"
@@ -169,7 +168,7 @@ def _advice(axis: Any, answer: dict[str, Any]) -> None:
         linewidth=1.0,
         capsize=2,
     )
-    axis.axvline(1.0, color=_RED, linestyle=":", linewidth=1.2)
+    axis.axvline(1.0, color=RED, linestyle=":", linewidth=1.2)
     axis.set_yticks([-k for k in range(len(rows))], [name for name, _ in rows], fontsize=7.5)
     axis.set_xlim(0, 1.3 * max(1.0, *(row["merit"] for _, row in rows)))
     axis.set_xlabel("largest rms error over the requirement")

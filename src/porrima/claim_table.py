@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import TYPE_CHECKING, Any
 
 from porrima.claims import VERDICTS
+from porrima.markdown import markdown_table, with_text_between
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -48,12 +48,14 @@ def claim_table(result: Mapping[str, Any]) -> str:
     return "\n\n".join(
         [
             f"{len(claims)} statements; {counts}.",
-            _table(
+            markdown_table(
                 ["no.", "statement", "the paper says", "Porrima finds", "which is", "verdict", "why"],
                 of_claims,
             ),
             "The numbers behind them:",
-            _table(["no.", "number", "value", "has to be", "slack [σ]", "fits", "assumption"], of_numbers),
+            markdown_table(
+                ["no.", "number", "value", "has to be", "slack [σ]", "fits", "assumption"], of_numbers
+            ),
         ]
     )
 
@@ -73,10 +75,7 @@ def with_claims(document: str, result: Mapping[str, Any]) -> str:
     document : str
         The rest of it unchanged.
     """
-    between = f"{BEGIN}\n\n{claim_table(result)}\n\n{END}"
-    return re.sub(
-        f"{re.escape(BEGIN)}.*?{re.escape(END)}", lambda _: between, document, count=1, flags=re.DOTALL
-    )
+    return with_text_between(document, BEGIN, END, claim_table(result))
 
 
 def _measured(value: float | None, error: float | None) -> str:
@@ -109,7 +108,3 @@ def _limits(one: Mapping[str, Any]) -> str:
 
 def _slack(value: float) -> str:
     return f"{value:g}".replace("-", "−")
-
-
-def _table(heads: list[str], rows: list[list[str]]) -> str:
-    return "\n".join(f"| {' | '.join(row)} |" for row in [heads, ["---"] * len(heads), *rows])

@@ -16,6 +16,7 @@ from typer.exceptions import TyperException
 from porrima.errors import InputError, RunError
 from porrima.options import (
     Band,
+    BinaryFraction,
     Catalogue,
     Colour,
     EstimatorName,
@@ -146,9 +147,7 @@ def predict(
     pixel_scale: PixelScale = None,
     jitter: Jitter = None,
     estimator: EstimatorName = "adaptive",
-    binary_fraction: Annotated[
-        float | None, typer.Option(help="0 to 1; as the model gives it if not given.")
-    ] = None,
+    binary_fraction: BinaryFraction = None,
     n_stars: Annotated[int | None, typer.Option(help="In the stack; infinitely many if not given.")] = None,
     multiplicity: MultiplicityName = "dk13",
     photometry: PhotometryName = "main-sequence",
@@ -168,8 +167,6 @@ def predict(
     from porrima.shapes import estimator_from_name
 
     catalog, format = table_of(stars, catalog, format)  # noqa: A001
-    if binary_fraction is not None and not 0 <= binary_fraction <= 1:
-        raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     if n_stars is not None and n_stars < 1:
         raise InputError("must be at least 1", key="--n-stars", value=n_stars)
     config = population_config(

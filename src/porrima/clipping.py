@@ -246,19 +246,14 @@ def _count(  # type: ignore[no-untyped-def]
     at[:] = 0.0
     for s in prange(mass.size):
         i, w, log_mass = index[s], weight[s], math.log10(mass[s])
-        primary = magnitude_on_track(
-            grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
-        )
+        primary = magnitude_on_track(grid, log_mass_min, log_mass, i, w)
         g, norm, last, span, nodes = mass_ratio_rule(
             mass[s], dark_below, q_min[s], q_max[s], exponent[s], given[s], intervals
         )
         one, dark, h = not math.isnan(given[s]), 1.0, span / intervals
         for k in range(nodes):
             log_q = h * k - span + last
-            magnitude = magnitude_on_track(
-                grid, log_mass_min, log_mass + log_q * to_log,
-                i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],
-            )  # fmt: skip
+            magnitude = magnitude_on_track(grid, log_mass_min, log_mass + log_q * to_log, i, w)
             f = min(math.exp(to_exponent * (magnitude - primary)), 1.0)
             simpson = 1.0 if k == 0 or k == intervals else 4.0 if k % 2 else 2.0
             share = 1.0 if one else math.exp(g * log_q) / norm * h / 3.0 * simpson

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from porrima.answers import COLOUR_KEYS, colour_answer, population_config
-from porrima.budget import Setting, budget
+from porrima.budget import Premises, budget
 from porrima.colour import chromatic
 from porrima.config import GalaxiesConfig, known, load_requirement, parse
 from porrima.deconvolution import fit_response
@@ -224,8 +224,6 @@ def decided(
     """
     if n_stars < 1:
         raise InputError("must be at least 1", key="--n-stars", value=n_stars)
-    if binary_fraction is not None and not 0 <= binary_fraction <= 1:
-        raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     survey, requirement = survey_of(instrument, requirements)
     sizes, ranges = galaxies_of(galaxy_size, galaxies), magnitude_bins(mag, bins, step)
     config = population_config(**options, mag=mag, cut=survey.cut if cut is None else cut)
@@ -237,7 +235,7 @@ def decided(
         blur: dict[str, Any] = {"pixel": pixel or own[0], "jitter": jitter or own[1]}
         waves = chromatic(psf or survey.psf, method, colour, **blur)
     parts, reply = _stars_of(config, ranges), response(profile, method)
-    setting = Setting(
+    premises = Premises(
         requirement=requirement,
         response=reply,
         n_stars=n_stars,
@@ -251,24 +249,24 @@ def decided(
     )
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        found = budget(setting, parts)
+        found = budget(premises, parts)
     for one in {str(one.message): one for one in said}.values():  # each bin says the same
         warnings.warn(one.message, stacklevel=2)
     answer = budget_answer(found, profile.name, estimator, sizes)
     for row, (_, stars) in zip(answer["bins"], parts, strict=True):
-        row |= _colours(config, stars, waves, setting)
+        row |= _colours(config, stars, waves, premises)
     return answer, found
 
 
 def _colours(
-    config: PopulationConfig, stars: Stars, waves: Chromatic | None, setting: Setting
+    config: PopulationConfig, stars: Stars, waves: Chromatic | None, premises: Premises
 ) -> dict[str, Any]:
     """What the colour of the companions of a bin does; None where it is not asked for."""
     if waves is None:
         return dict.fromkeys(COLOUR_KEYS)
-    population = population_of(config, stars, setting.response)
-    fraction = None if setting.binary_fraction is None else np.array([setting.binary_fraction])
-    r2_0 = float(setting.response.shape0.r2)
+    population = population_of(config, stars, premises.response)
+    fraction = None if premises.binary_fraction is None else np.array([premises.binary_fraction])
+    r2_0 = float(premises.response.shape0.r2)
     return colour_answer(config, population, integrate(population), waves, r2_0, fraction)
 
 

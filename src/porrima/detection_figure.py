@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from porrima.figures import STYLE
+from porrima.figures import RED, STYLE
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -16,8 +16,6 @@ __all__ = ["detection_maps"]
 
 LEVELS = (0.1, 0.5, 0.9)
 """Of the contours (probability)."""
-
-_RED = "#b00020"
 
 
 def detection_maps(maps: xr.Dataset) -> Figure:
@@ -49,7 +47,7 @@ def detection_maps(maps: xr.Dataset) -> Figure:
             axis.set_xlabel("separation [arcsec]")
         bar = figure.colorbar(mesh, ax=axes, label="probability of detection", pad=0.01)
         for level in LEVELS:
-            bar.ax.axhline(level, color=_RED, linewidth=1.0)
+            bar.ax.axhline(level, color=RED, linewidth=1.0)
     return figure
 
 
@@ -59,7 +57,7 @@ def _map(axis: Any, probability: xr.DataArray, cut: float) -> Any:
     mesh = axis.pcolormesh(
         *place, probability, vmin=0, vmax=1, cmap="Blues", shading="gouraud", rasterized=True
     )
-    axis.contour(*place, probability, levels=LEVELS, colors=_RED, linewidths=(0.7, 1.2, 0.7))
+    axis.contour(*place, probability, levels=LEVELS, colors=RED, linewidths=(0.7, 1.2, 0.7))
     axis.axvline(cut, color="#e69f00", linestyle="--", linewidth=1.2)
     axis.set_xscale("log")
     axis.set_xticks([0.01, 0.02, 0.05, 0.1], ["0.01", "0.02", "0.05", "0.1"])

@@ -10,7 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from porrima.figures import COLOURS, STYLE
+from porrima.figures import COLOURS, RED, STYLE
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,7 +26,6 @@ __all__ = [
     "pair_sketch",
 ]
 
-_RED = "#b00020"
 _TITLES = {"psf": "shape of the PSF", "fit": "shear, fit", "moments": "shear, moments"}
 _LABELS = {"e1": "$e_1$", "e2": "$e_2$", "r2": "$R^2$", "m": "$m$", "c1": "$c_1$", "c2": "$c_2$"}
 
@@ -56,7 +55,7 @@ def budget_shares(answer: dict[str, Any]) -> Figure:
                 COLOURS, dict.fromkeys(row["quantity"] for row in here), strict=False
             ):
                 _share_line(axis, [row for row in here if row["quantity"] == quantity], colour)
-            axis.axhline(1.0, color=_RED, linestyle=":", linewidth=1.2)
+            axis.axhline(1.0, color=RED, linestyle=":", linewidth=1.2)
             axis.set(yscale="log", xlabel="magnitude", title=_TITLES[group])
             axis.legend(frameon=False, fontsize=8)
         axes[0].set_ylabel("share of the requirement")
@@ -109,7 +108,7 @@ def colour_against_eta(answers: dict[str, dict[str, Any]]) -> Figure:
                         axis.plot(*zip(*here, strict=True), linestyle="", marker=marker, **look)
                 axis.plot([], [], color=colour, linestyle=":", marker=marker, markersize=4.5, label=label)
             if answer["required_sigma_r2"] is not None:
-                axis.axhline(answer["required_sigma_r2"], color=_RED, linestyle="--", linewidth=1.0)
+                axis.axhline(answer["required_sigma_r2"], color=RED, linestyle="--", linewidth=1.0)
             axis.set(yscale="log", xlabel="$i$ [mag]", title=title)
         axes[0].set_ylabel(r"$|\delta R^2| / R_0^2$")
         handles, labels = axes[0].get_legend_handles_labels()
@@ -164,7 +163,7 @@ def against_magnitude(data: xr.Dataset, requirement: Requirement) -> Figure:
                 (column[1], "e", requirement.sigma_e), (column[2], "r2", requirement.sigma_r2),
             ):  # fmt: skip
                 _errors(axis, here, quantity, middle, norm)
-                axis.axhline(required, color=_RED, linestyle=":", linewidth=1.2)
+                axis.axhline(required, color=RED, linestyle=":", linewidth=1.2)
             column[0].set_title(model, fontsize=9.5)
             column[-1].set_xlabel(f"${data.attrs['band']}$ [mag]")
         for row, (_, label, limits) in zip(axes, _ROWS, strict=True):
@@ -206,7 +205,7 @@ def _magnitude_legend(figure: Figure, axes: Any, data: xr.Dataset, requirement: 
     entries.append(
         ({"color": "0.6", "linewidth": 0.8}, f"scatter of {data.attrs['n_stars']} stars, Gaussian PSF")
     )
-    entries.append(({"color": _RED, "linestyle": ":"}, f"requirement ({requirement.name})"))
+    entries.append(({"color": RED, "linestyle": ":"}, f"requirement ({requirement.name})"))
     handles = [axes[0, 0].plot([], [], **look)[0] for look, _ in entries]
     labels = [label for _, label in entries]
     figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False, fontsize=8.5)

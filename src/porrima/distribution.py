@@ -305,9 +305,7 @@ def _count_pairs(  # type: ignore[no-untyped-def]
     to_log, to_exponent = 1.0 / math.log(10.0), -0.4 * math.log(10.0)
     for s in range(mass.size):
         i, w, log_mass = index[s], weight[s], math.log10(mass[s])
-        primary = magnitude_on_track(
-            grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
-        )
+        primary = magnitude_on_track(grid, log_mass_min, log_mass, i, w)
         g = exponent[s] + 1.0
         first = min(max(dark_below / mass[s], q_min[s]), q_max[s])
         norm = (q_max[s] ** g - q_min[s] ** g) / g if abs(g) > 1e-9 else math.log(q_max[s] / q_min[s])
@@ -322,10 +320,7 @@ def _count_pairs(  # type: ignore[no-untyped-def]
         for k in range(steps):
             log_q = math.log(given[s]) if one else last - span * (1.0 - (k + 0.5) / steps)
             share = pair[s] if one else pair[s] * math.exp(g * log_q) / norm * span / steps
-            magnitude = magnitude_on_track(
-                grid, log_mass_min, log_mass + log_q * to_log,
-                i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],
-            )  # fmt: skip
+            magnitude = magnitude_on_track(grid, log_mass_min, log_mass + log_q * to_log, i, w)
             f = min(math.exp(to_exponent * (magnitude - primary)), 1.0)
             four_y = 4.0 * f / (1.0 + f) ** 2
             cell = int(count.shape[2] * (1.0 + math.log10(max(four_y, 1e-300)) / _Y_DECADES))

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 __all__ = [
-    "NODES", "Eccentricity", "eccentric", "eccentricity_index", "largest_eccentricity",
-    "log_period", "mean_eccentricity", "orbit_nodes",
+    "NODES", "Eccentricity", "eccentric", "eccentricity_index", "largest_eccentricity", "log_period", "orbit_nodes",
 ]  # fmt: skip
 
 Eccentricity = Literal["circular", "uniform", "thermal", "mds17"]
@@ -95,25 +94,6 @@ def largest_eccentricity(period: FloatArray) -> FloatArray:
     MoeDiStefano2017
     """
     return 1.0 - np.minimum((10.0**period / 2.0) ** (-2.0 / 3.0), 1.0)
-
-
-def mean_eccentricity(eccentricity: Eccentricity, period: float) -> float:
-    r"""Mean eccentricity of orbits of one period.
-
-    Parameters
-    ----------
-    eccentricity : {"circular", "uniform", "thermal", "mds17"}
-        The law.
-    period : float
-        log10 of the period in days, of which ``mds17`` makes use.
-
-    Returns
-    -------
-    mean : float
-        In [0, 1): :math:`e_{max} (\eta + 1)/(\eta + 2)`.
-    """
-    largest, index = _power_law(eccentricity, period)
-    return largest * (index + 1.0) / (index + 2.0)
 
 
 def _power_law(eccentricity: Eccentricity, period: float) -> tuple[float, float]:

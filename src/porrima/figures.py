@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "COLOURS",
     "MARKERS",
+    "RED",
     "STYLE",
     "at_one_fraction",
     "effect_of_n_stars",
@@ -34,6 +35,7 @@ COLOURS = (
     "#e69f00",
     "#56b4e9",
 )  # Okabe & Ito, safe for all eyes
+RED = "#b00020"  # what is required, and what one is warned of
 MARKERS = ("o", "s", "^", "D", "v", "P")
 _PANELS = (
     ("r2", r"$\sigma(R^2)/R_0^2$", r"$\langle\delta R^2\rangle/R_0^2$"),
@@ -81,7 +83,7 @@ def errors_and_biases(
                 axis.set_ylabel(label)
                 axis.ticklabel_format(axis="y", style="sci", scilimits=(0, 0), useMathText=True)
             required = requirement.sigma_r2 if quantity == "r2" else requirement.sigma_e
-            row[0].axhline(required, color="#b00020", linestyle=":", linewidth=1.2)
+            row[0].axhline(required, color=RED, linestyle=":", linewidth=1.2)
             row[0].set_ylim(bottom=0.0)
         for axis in axes[-1]:
             axis.set_xlabel("binary fraction of the population")
@@ -121,7 +123,7 @@ def _legend(figure: Figure, axis: Any, curves: xr.Dataset, requirement: Requirem
     for style, label in (
         ({"color": "0.2"}, f"prediction, {n_stars} stars"),
         ({"color": "0.2", "linestyle": "--"}, "prediction, infinitely many stars"),
-        ({"color": "#b00020", "linestyle": ":"}, f"requirement ({requirement.name})"),
+        ({"color": RED, "linestyle": ":"}, f"requirement ({requirement.name})"),
     ):
         handles += axis.plot([], [], **style)
         labels.append(label)
@@ -160,7 +162,7 @@ def at_one_fraction(summary: xr.Dataset, requirement: Requirement) -> Figure:
                 )  # fmt: skip
             required = requirement.sigma_r2 if quantity == "r2" else requirement.sigma_e
             if required is not None:
-                axis.axvline(required, color="#b00020", linestyle=":", linewidth=1.2)
+                axis.axvline(required, color=RED, linestyle=":", linewidth=1.2)
             axis.axvline(0.0, color="0.6", linewidth=0.6, zorder=0)
             axis.set_xlabel(label)
             axis.ticklabel_format(axis="x", style="sci", scilimits=(0, 0), useMathText=True)
@@ -213,7 +215,7 @@ def effect_of_n_stars(numbers: xr.Dataset, limit: xr.Dataset, requirement: Requi
                     linewidth=0.9,
                     linestyle=("--", "-.")[p % 2],
                 )
-            axis.axhline(requirement.sigma_e, color="#b00020", linestyle=":", linewidth=1.2)
+            axis.axhline(requirement.sigma_e, color=RED, linestyle=":", linewidth=1.2)
             axis.set_yscale("log")
             axis.set_ylim(1e-6, 4e-3)
             axis.set_xlim(0.0, 1.0)
@@ -241,7 +243,7 @@ def _legend_of_n_stars(figure: Figure, axis: Any, numbers: xr.Dataset, requireme
         labels.append(f"{name}, infinitely many")
     handles += axis.plot([], [], color="0.25", linewidth=1.0)
     labels.append("prediction")
-    handles += axis.plot([], [], color="#b00020", linestyle=":", linewidth=1.2)
+    handles += axis.plot([], [], color=RED, linestyle=":", linewidth=1.2)
     labels.append(f"requirement ({requirement.name})")
     figure.legend(handles, labels, loc="outside upper center", ncols=4, frameon=False, fontsize=8.0)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-__all__ = ["make_folder", "write_table", "write_whole"]
+__all__ = ["json_ready", "make_folder", "write_json", "write_table", "write_whole"]
 
 
 def make_folder(path: Path) -> None:
@@ -89,3 +91,44 @@ def write_table(table: Any, path: Path) -> None:
         The result is the file.
     """
     write_whole(path, lambda unfinished: table.write(unfinished, format="ascii.ecsv"))
+
+
+def write_json(value: Any, path: Path) -> None:
+    """A result as JSON, a line for each value.
+
+    Parameters
+    ----------
+    value : dict
+        Keys and values, lists and objects in them.
+    path : Path
+        The file, replaced if it exists.
+
+    Returns
+    -------
+    None
+        The result is the file.
+    """
+    text = json.dumps(json_ready(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    write_whole(path, lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
+
+
+def json_ready(value: Any) -> Any:
+    """A result as JSON has it.
+
+    Parameters
+    ----------
+    value : object
+        A dict, list, number or text.
+
+    Returns
+    -------
+    value : object
+        The same without numpy's floats, and with null for what is not a finite number.
+    """
+    if isinstance(value, dict):
+        return {key: json_ready(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_ready(inner) for inner in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value

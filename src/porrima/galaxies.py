@@ -239,11 +239,6 @@ class Galaxies:
         return float(np.sum(self.weight / self.r2))
 
     @property
-    def responsivity(self) -> float:
-        r""":math:`P_\gamma = 2 - \langle e^2 \rangle`: mean distortion over shear, dimensionless."""
-        return 2.0 - self.mean_e2
-
-    @property
     def half_light_radius(self) -> FloatArray:
         """Half-light radius of each size made round, (n,), in arcsec."""
         return np.sqrt(self.r2 / r2_of_half_light(self.index))

@@ -108,7 +108,7 @@ def headline(
     )
 
 
-def write_headline(folder: str | Path) -> str:
+def write_headline(folder: str | Path) -> Path:
     """The figure written.
 
     Parameters
@@ -118,14 +118,14 @@ def write_headline(folder: str | Path) -> str:
 
     Returns
     -------
-    path : str
+    path : Path
         Of the figure.
     """
     from porrima.headline_figure import levers  # noqa: PLC0415  (slow to import, where used)
 
     path = Path(folder) / "headline.png"
     write_figure(levers(headline()), path)
-    return str(path)
+    return path
 
 
 def _stars(low: float, high: float, n_drawn: int) -> Stars:

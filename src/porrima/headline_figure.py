@@ -8,14 +8,13 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
-from porrima.figures import COLOURS, STYLE
+from porrima.figures import COLOURS, RED, STYLE
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["levers"]
 
-_RED = "#b00020"
 _SHARES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 _WAYS = {
     "dk13": ("table as published", COLOURS[0], "o-"),
@@ -57,12 +56,12 @@ def levers(data: xr.Dataset) -> Figure:
                 label=label.format(**data.attrs),
             )
         for axis in (left, right):
-            axis.axhline(1.0, color=_RED, linestyle=":", linewidth=1.2)
+            axis.axhline(1.0, color=RED, linestyle=":", linewidth=1.2)
             axis.yaxis.set_major_locator(FixedLocator(_SHARES))
             axis.yaxis.set_minor_formatter(NullFormatter())
             axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.legend(frameon=False, fontsize=8, loc="best")
-        left.text(1.0, 0.92, "requirement (KCM16)", color=_RED, fontsize=8, va="top")
+        left.text(1.0, 0.92, "requirement (KCM16)", color=RED, fontsize=8, va="top")
         left.set(
             xlabel=r"stars in the PSF, $N_\star$",
             ylabel="error / requirement",

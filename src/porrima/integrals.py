@@ -359,9 +359,7 @@ def _coefficients(  # type: ignore[no-untyped-def]
     to_log, to_exponent = 1.0 / math.log(10.0), -0.4 * math.log(10.0)
     for s in prange(mass.size):
         i, w, log_mass = index[s], weight[s], math.log10(mass[s])
-        primary = magnitude_on_track(
-            grid, log_mass_min, log_mass, i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
-        )
+        primary = magnitude_on_track(grid, log_mass_min, log_mass, i, w)
         out[:, s, :] = 0.0
         out[:, s, 0] = 1.0
         g, norm, last, span, nodes = mass_ratio_rule(
@@ -370,10 +368,7 @@ def _coefficients(  # type: ignore[no-untyped-def]
         h = span / intervals
         for k in range(nodes):
             log_q = h * k - span + last
-            magnitude = magnitude_on_track(
-                grid, log_mass_min, log_mass + log_q * to_log,
-                i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3],
-            )  # fmt: skip
+            magnitude = magnitude_on_track(grid, log_mass_min, log_mass + log_q * to_log, i, w)
             f = min(math.exp(to_exponent * (magnitude - primary)), 1.0)
             if nodes == 1:
                 _add_powers(1.0, f, out[0, s])

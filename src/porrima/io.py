@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,8 +10,9 @@ import numpy as np
 from porrima.errors import InputError
 from porrima.files import write_table, write_whole
 from porrima.galaxies import Galaxies, r2_of_half_light
+from porrima.rows import refuse_unless
 from porrima.systems import Systems
-from porrima.tables import column_values, load_table, open_catalog
+from porrima.tables import load_table, named_columns, open_catalog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -44,28 +46,15 @@ def read_systems(path: Path) -> Systems:
         If a column is missing or a value breaks its rule: names the row.
     """
     table, row = load_table(open_catalog(path, {}, None))
-    values = {}
-    for name, unit in (_PAIR_COLUMNS | {"weight": ""}).items():
-        if name in table.colnames:
-            values[name] = column_values(path, table[name], name, unit, row)
-        elif name != "weight":
-            raise InputError(
-                f"is missing; the table has {', '.join(table.colnames)}", source=path, column=name
-            )
-    values.setdefault("weight", np.ones(len(table)))
-    if not len(table):
-        raise InputError("must have rows below its header", source=path)
-    f, w = values["flux_ratio"], values["weight"]
-    good = {
-        "flux_ratio": ("must be in [0, 1]", (f >= 0) & (f <= 1)),
-        "dx": ("must be within 10 arcsec", np.abs(values["dx"]) <= _WIDEST),
-        "dy": ("must be within 10 arcsec", np.abs(values["dy"]) <= _WIDEST),
-        "weight": ("must be finite and not negative", np.isfinite(w) & (w >= 0)),
-    }
-    for name, (rule, fine) in good.items():
-        if not np.all(fine):
-            k = int(np.argmin(fine))
-            raise InputError(rule, source=path, row=int(row[k]), column=name, value=values[name][k])
+    values = named_columns(path, table, row, _PAIR_COLUMNS, {"weight": ""})
+    f, w = values["flux_ratio"], values.setdefault("weight", np.ones(len(table)))
+    rules = [
+        ("flux_ratio", "must be in [0, 1]", (f >= 0) & (f <= 1)),
+        ("dx", "must be within 10 arcsec", np.abs(values["dx"]) <= _WIDEST),
+        ("dy", "must be within 10 arcsec", np.abs(values["dy"]) <= _WIDEST),
+        ("weight", "must be finite and not negative", np.isfinite(w) & (w >= 0)),
+    ]
+    refuse_unless(path, row, values, rules)
     if not w.sum() > 0:
         raise InputError("must have a positive sum", source=path, column="weight", value=w.sum())
     return Systems.from_pairs(f, values["dx"], values["dy"], w)
@@ -96,27 +85,13 @@ def read_galaxies(path: Path, index: float, mean_e2: float, smallest: float = 0.
         If the column is missing, there are no galaxies, or a value breaks its rule: names the row.
     """
     table, row = load_table(open_catalog(path, {}, None))
-    if "half_light_radius" not in table.colnames:
-        names = ", ".join(table.colnames)
-        raise InputError(f"is missing; the table has {names}", source=path, column="half_light_radius")
-    if not len(table):
-        raise InputError("must have rows below its header", source=path)
-    radius = column_values(path, table["half_light_radius"], "half_light_radius", "arcsec", row)
-    weight = np.ones(len(table))
-    if "weight" in table.colnames:
-        weight = column_values(path, table["weight"], "weight", "", row)
-    good = {
-        "half_light_radius": (
-            "must be positive and finite [arcsec]",
-            np.isfinite(radius) & (radius > 0),
-            radius,
-        ),
-        "weight": ("must be finite and not negative", np.isfinite(weight) & (weight >= 0), weight),
-    }
-    for name, (rule, fine, values) in good.items():
-        if not np.all(fine):
-            k = int(np.argmin(fine))
-            raise InputError(rule, source=path, row=int(row[k]), column=name, value=values[k])
+    values = named_columns(path, table, row, {"half_light_radius": "arcsec"}, {"weight": ""})
+    radius, weight = values["half_light_radius"], values.setdefault("weight", np.ones(len(table)))
+    rules = [
+        ("half_light_radius", "must be positive and finite [arcsec]", np.isfinite(radius) & (radius > 0)),
+        ("weight", "must be finite and not negative", np.isfinite(weight) & (weight >= 0)),
+    ]
+    refuse_unless(path, row, values, rules)
     galaxies = Galaxies.sersic(radius, index, weight, mean_e2=mean_e2)
     return galaxies.larger_than(smallest**2 * r2_of_half_light(index)) if smallest > 0 else galaxies
 
@@ -187,7 +162,7 @@ def write_rows_and_figure(
     Parameters
     ----------
     rows : sequence of dict
-        As `write_rows` takes them.
+        As `write_rows` takes them; where one has None there is NaN in the file.
     table, picture : Path or None
         Files to write; none where not given.
     draw : callable
@@ -211,6 +186,7 @@ def write_rows_and_figure(
         if path is not None and not path.parent.is_dir():
             raise InputError("cannot be written (No such folder)", key="output", value=path)
     if table is not None:
-        write_rows(rows, table, made_with)
+        known = [{key: math.nan if value is None else value for key, value in row.items()} for row in rows]
+        write_rows(known, table, made_with)
     if picture is not None:
         write_figure(draw(), picture)

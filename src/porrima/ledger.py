@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from porrima.galaxies import Galaxies
     from porrima.shares import Interval, MagnitudeBin, Share
 
-__all__ = ["BUDGET_COLUMNS", "budget_answer", "budget_lines", "header_of", "write_budget"]
+__all__ = ["BUDGET_COLUMNS", "budget_answer", "budget_header", "budget_lines", "write_budget"]
 
 _FEWEST_DIGITS = 1e-12  # a bias below it is the rounding of 0
 
@@ -40,8 +40,8 @@ def budget_answer(found: Budget, psf: str, estimator: str, galaxies: Galaxies) -
     answer : dict
         Dimensionless, mag, arcsec.
     """
-    setting = found.setting
-    requirement, shape = setting.requirement, setting.response.shape0
+    premises = found.premises
+    requirement, shape = premises.requirement, premises.response.shape0
     return {
         "requirement": requirement.name,
         "source": requirement.source,
@@ -54,13 +54,13 @@ def budget_answer(found: Budget, psf: str, estimator: str, galaxies: Galaxies) -
         "r2_0": float(shape.r2),
         "e1_0": float(shape.e1),
         "e2_0": float(shape.e2),
-        "cut": setting.cut,
-        "n_stars": setting.n_stars,
-        "binary_fraction": setting.binary_fraction,
+        "cut": premises.cut,
+        "n_stars": premises.n_stars,
+        "binary_fraction": premises.binary_fraction,
         "galaxy_index": galaxies.index,
         "galaxy_inverse_r2": galaxies.inverse_r2,
-        "kappa_gal": None if setting.fit is None else setting.fit.kappa_m,
-        "seen_inverse_r2": None if setting.seen is None else setting.seen.inverse_r2,
+        "kappa_gal": None if premises.fit is None else premises.fit.kappa_m,
+        "seen_inverse_r2": None if premises.seen is None else premises.seen.inverse_r2,
         "bins": [_bin_row(one) for one in found.bins],
         "verdicts": [_verdict_row(one, group) for one in found.bins for group in found.groups],
         "shares": [_share_row(one, share) for one in found.bins for share in one.shares],
@@ -139,7 +139,7 @@ def budget_lines(found: Budget) -> list[list[Any]]:
     lines : list of list
         Under `BUDGET_COLUMNS`.
     """
-    lines, end = [], found.setting.cut * CUTS[-1] * (1 - 1e-9)
+    lines, end = [], found.premises.cut * CUTS[-1] * (1 - 1e-9)
     for one in found.bins:
         low, high = (1e4 * end for end in one.uncertainty.interval("eta"))
         eta = f"{1e4 * one.uncertainty.prediction.eta[0]:.2f} ({low:.2f}-{high:.2f})"
@@ -163,7 +163,7 @@ def _percent(share: Share | None) -> str:
     return f"{bias:.0f} / {share.total.value * of:.0f} %"
 
 
-def header_of(answer: dict[str, Any], multiplicity: str) -> str:
+def budget_header(answer: dict[str, Any], multiplicity: str) -> str:
     """Lines above the table on the terminal.
 
     Parameters
@@ -225,9 +225,5 @@ def write_budget(answer: dict[str, Any], table: Path | None, picture: Path | Non
 
         return budget_shares(answer)
 
-    empty = {"required": math.nan, "verdict": ""}
-    rows = [
-        {key: empty.get(key, math.nan) if value is None else value for key, value in row.items()}
-        for row in answer["shares"]
-    ]
+    rows = [row | {"verdict": row["verdict"] or ""} for row in answer["shares"]]
     write_rows_and_figure(rows, table, draw, picture)

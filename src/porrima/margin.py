@@ -243,9 +243,7 @@ class _Look:
         few = []
         for one, s, part in zip(self.bins, chosen, share, strict=True):
             n = min(max(round(most * part), _LEAST), len(s))
-            order = np.lexsort((s.distance, np.round(np.log10(s.mass), 1)))
-            some = s.take(order[((np.arange(n) + 0.5) * len(s) / n).astype(np.int64)])
-            few.append(replace(some, magnitude=np.full(n, 0.5 * sum(one.magnitude))))
+            few.append(replace(s.evenly(n), magnitude=np.full(n, 0.5 * sum(one.magnitude))))
         return few
 
     def stack(self, populations: list[Population], companions: Companions) -> Stacked:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import math
 from typing import TYPE_CHECKING, Any
 
 from porrima.errors import InputError
-from porrima.files import make_folder, write_whole
+from porrima.files import make_folder, write_json
 from porrima.io import write_rows_and_figure
 
 if TYPE_CHECKING:
@@ -164,17 +162,6 @@ def write_advice(answer: dict[str, Any], folder: Path | None) -> None:
     if folder is None:
         return
     make_folder(folder)
-    rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in answer["settings"]]
     made_with = {key: value for key, value in answer.items() if not isinstance(value, list)}
-    write_rows_and_figure(rows, folder / "select.ecsv", draw, folder / "select.png", made_with)
-    text = json.dumps(_finite(answer), allow_nan=False, indent=1)
-    write_whole(folder / "select.json", lambda part: part.write_text(text + "\n", encoding="utf-8"))
-
-
-def _finite(value: Any) -> Any:
-    """Null for what is not a finite number."""
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    write_rows_and_figure(answer["settings"], folder / "select.ecsv", draw, folder / "select.png", made_with)
+    write_json(answer, folder / "select.json")

@@ -63,7 +63,18 @@ Survey = Annotated[str | None, typer.Option("--survey", "--instrument", help="eu
 Folder = Annotated[Path | None, typer.Option("--output", "-o", help="Folder: table, numbers and figure.")]
 StarsTable = Annotated[Path | None, typer.Option("--stars", help="Table as `porrima stars` writes it.")]
 SurveyPsf = Annotated[str | None, typer.Option("--psf", help="Name of the PSF; the instrument's.")]
-BinaryFraction = Annotated[float | None, typer.Option(help="0 to 1; as the model gives it if not given.")]
+
+
+def _fraction(value: float | None) -> float | None:
+    """A binary fraction, where one is given."""
+    if value is not None and not 0 <= value <= 1:
+        raise InputError("must be in [0, 1]", key="--binary-fraction", value=value)
+    return value
+
+
+BinaryFraction = Annotated[
+    float | None, typer.Option(help="0 to 1; as the model gives it if not given.", callback=_fraction)
+]
 GalaxySize = Annotated[
     float | None, typer.Option(help="Half-light radius of exponential galaxies [arcsec]; 0.3.")
 ]

@@ -10,7 +10,8 @@ import numpy as np
 
 from porrima.correction import Patch
 from porrima.errors import InputError
-from porrima.tables import column_values, load_table, open_catalog
+from porrima.rows import refuse_unless
+from porrima.tables import load_table, named_columns, open_catalog
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -172,28 +173,18 @@ def read_patches(path: Path) -> PatchTable:
         near = difflib.get_close_matches(name, [*COLUMNS, "patch"], n=1, cutoff=_ALIKE)
         if near and near[0] not in names and name not in COLUMNS:
             raise InputError(f"is no column of patches (did you mean {near[0]}?)", source=path, column=name)
-    for name in ("r2", "n_stars"):
-        if name not in names:
-            raise InputError(f"is missing; the table has {', '.join(names)}", source=path, column=name)
-    values = {
-        name: column_values(path, table[name], name, unit, row)
-        for name, unit in COLUMNS.items()
-        if name in names
-    }
+    needed = {name: COLUMNS[name] for name in ("r2", "n_stars")}
+    values = named_columns(path, table, row, needed, COLUMNS)
     for pair in _TOGETHER:
         for one, other in (pair, pair[::-1]):
             if one in values and other not in values:
                 raise InputError(f"is missing beside {one}", source=path, column=other)
-    for name, needed in _NEEDS.items():
-        if name in values and needed not in values:
-            raise InputError(f"is missing beside {name}", source=path, column=needed)
-    if not 0 < len(table) <= MOST_PATCHES:
-        raise InputError(f"must have 1 to {MOST_PATCHES} rows", source=path, value=len(table))
-    for name, rule, good in _rules(values):
-        if not good.all():
-            k = int(np.argmin(good))
-            value = f"{values[name][k]:g}"
-            raise InputError(rule, source=path, row=int(row[k]), column=name, value=value)
+    for name, other in _NEEDS.items():
+        if name in values and other not in values:
+            raise InputError(f"is missing beside {name}", source=path, column=other)
+    if len(table) > MOST_PATCHES:
+        raise InputError(f"must have no more than {MOST_PATCHES} rows", source=path, value=len(table))
+    refuse_unless(path, row, values, _rules(values))
     named = "patch" in names
     name = tuple(str(one) for one in (table["patch"] if named else range(1, len(row) + 1)))
     return PatchTable(source=path, row=row, name=name, named=named, values=values)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
-import re
 from typing import TYPE_CHECKING, Any
 
 from porrima.figures import performance
-from porrima.files import make_folder, write_whole
+from porrima.files import make_folder, write_json, write_whole
 from porrima.io import write_figure
+from porrima.markdown import markdown_table, with_text_between
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -95,7 +94,7 @@ def tables(result: dict[str, Any]) -> str:
             "Engine with moments alone, over:",
             _pivot(ratios, "against", "ratio_moments"),
             "Shapes of stacks of 40 stars:",
-            _table(
+            markdown_table(
                 ["measured by", "PSF", "10³ shapes/s", "over HSM"],
                 [
                     [NAMES[row["measurer"]], row["psf"], _number(row, "shapes_per_s", 1e-3), _over_hsm(row)]
@@ -103,7 +102,7 @@ def tables(result: dict[str, Any]) -> str:
                 ],
             ),
             "Cost against the stars in a stack, in ns per star:",
-            _table(
+            markdown_table(
                 ["stars in a stack", "stacks", "moments", "with shapes"],
                 [
                     [_grouped(row["n_stars"]), _grouped(row["n_stacks"]), *_costs(row, 1e3 / row["n_stars"])]
@@ -111,12 +110,12 @@ def tables(result: dict[str, Any]) -> str:
                 ],
             ),
             "Cost against the number of stacks of 40 stars, in µs per stack:",
-            _table(
+            markdown_table(
                 ["stacks", "moments", "with shapes"],
                 [[_grouped(row["n_stacks"]), *_costs(row, 1.0)] for row in stacks],
             ),
             "Memory of whole runs (`porrima simulate`, one PSF, stacks of 40 stars):",
-            _table(
+            markdown_table(
                 ["stacks", "peak memory [MB]", "wall time [s]"],
                 [
                     [_grouped(r["n_stacks"]), f"{r['peak_mb']:.0f}", f"{r['run_s']:.1f}"]
@@ -142,10 +141,7 @@ def with_tables(document: str, result: dict[str, Any]) -> str:
     document : str
         The rest of it unchanged.
     """
-    between = f"{BEGIN}\n\n{tables(result)}\n\n{END}"
-    return re.sub(
-        f"{re.escape(BEGIN)}.*?{re.escape(END)}", lambda _: between, document, count=1, flags=re.DOTALL
-    )
+    return with_text_between(document, BEGIN, END, tables(result))
 
 
 def write_performance(result: dict[str, Any], folder: Path) -> None:
@@ -165,8 +161,7 @@ def write_performance(result: dict[str, Any], folder: Path) -> None:
         The result are the files, each whole.
     """
     make_folder(folder)
-    text = json.dumps(result, indent=1) + "\n"
-    write_whole(folder / "bench.json", lambda path: path.write_text(text, encoding="utf-8"))
+    write_json(result, folder / "bench.json")
     figure = performance(result)
     for suffix in ("png", "svg"):
         write_figure(figure, folder / f"performance.{suffix}")
@@ -213,15 +208,11 @@ def _grouped(value: float, digits: int = 0) -> str:
     return f"{value:,.{digits}f}".replace(",", " ")
 
 
-def _table(heads: list[str], rows: list[list[str]]) -> str:
-    return "\n".join(f"| {' | '.join(row)} |" for row in [heads, ["---"] * len(heads), *rows])
-
-
 def _pivot(rows: list[dict[str, Any]], key: str, value: str, factor: float = 1.0) -> str:
     """Table with a line for each name and a column for each kind of stack."""
     columns = list(dict.fromkeys(_where(row) for row in rows))
     names = list(dict.fromkeys(_name(row, key) for row in rows))
     cells = {(_name(row, key), _where(row)): _number(row, value, factor) for row in rows}
-    return _table(
+    return markdown_table(
         ["", *columns], [[name, *(cells.get((name, column), "") for column in columns)] for name in names]
     )

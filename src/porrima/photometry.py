@@ -69,27 +69,24 @@ class MassLuminosity(Protocol):
 
 
 @njit(inline="always")
-def magnitude_on_track(grid, log_mass_min, log_mass, i0, i1, i2, i3, w0, w1, w2, w3):  # type: ignore[no-untyped-def]
-    """Absolute magnitude of one mass (compiled; arguments as in `Tracks`, unchecked)."""
+def magnitude_on_track(grid, log_mass_min, log_mass, i, w):  # type: ignore[no-untyped-def]
+    """Absolute magnitude of one mass on the tracks i of a star, of weights w (compiled; as in `Tracks`, unchecked)."""
     position = (log_mass - log_mass_min) * (1.0 / STEP)
     k = min(max(int(position), 0), grid.shape[0] - 2)
     t = position - k
-    low = w0 * grid[k, i0] + w1 * grid[k, i1] + w2 * grid[k, i2] + w3 * grid[k, i3]
+    low = w[0] * grid[k, i[0]] + w[1] * grid[k, i[1]] + w[2] * grid[k, i[2]] + w[3] * grid[k, i[3]]
     k += 1
-    high = w0 * grid[k, i0] + w1 * grid[k, i1] + w2 * grid[k, i2] + w3 * grid[k, i3]
+    high = w[0] * grid[k, i[0]] + w[1] * grid[k, i[1]] + w[2] * grid[k, i[2]] + w[3] * grid[k, i[3]]
     return low + t * (high - low)
 
 
 @njit(cache=True)
 def _magnitudes(grid, log_mass_min, dark_below, index, weight, mass, out):  # type: ignore[no-untyped-def]
     for s in range(mass.shape[0]):
-        i, w = index[s], weight[s]
         for k in range(mass.shape[1]):
             out[s, k] = np.inf
             if mass[s, k] >= dark_below:
-                out[s, k] = magnitude_on_track(
-                    grid, log_mass_min, np.log10(mass[s, k]), i[0], i[1], i[2], i[3], w[0], w[1], w[2], w[3]
-                )
+                out[s, k] = magnitude_on_track(grid, log_mass_min, np.log10(mass[s, k]), index[s], weight[s])
 
 
 def magnitudes(tracks: Tracks, mass: FloatArray) -> FloatArray:

@@ -57,11 +57,6 @@ class Pointings:
     place: FloatArray
     roll: FloatArray
 
-    @property
-    def n_pixels(self) -> int:
-        """Pixels of all exposures (count)."""
-        return self.roll.size * self.side**2
-
     def images(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Stamps of sources of unit flux.
 

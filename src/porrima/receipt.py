@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 from porrima.io import write_rows_and_figure
@@ -126,6 +125,5 @@ def write_correction(answer: dict[str, Any], table: Path | None, picture: Path |
 
         return corrections(answer)
 
-    rows = [{k: math.nan if v is None else v for k, v in row.items()} for row in answer["values"]]
     made_with = {key: value for key, value in answer.items() if not isinstance(value, list)}
-    write_rows_and_figure(rows, table, draw, picture, made_with)
+    write_rows_and_figure(answer["values"], table, draw, picture, made_with)

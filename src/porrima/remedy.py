@@ -203,8 +203,6 @@ def corrected(
             raise InputError("cannot be given together with a table of patches", key=key)
     if instrument is None and psf is None:
         raise InputError("is missing, or --instrument", key="--psf")
-    if binary_fraction is not None and not 0 <= binary_fraction <= 1:
-        raise InputError("must be in [0, 1]", key="--binary-fraction", value=binary_fraction)
     patches = one_patch(shape, shape_error, n_stars) if table is None else read_patches(table)
     survey, requirement = survey_of(instrument or "kcm16", None)
     sizes, shapes = galaxies_of(galaxy_size, galaxies), estimator_from_name(estimator)

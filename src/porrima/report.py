@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import platform
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from porrima.config import RunConfig, parse
 from porrima.diagrams import against_magnitude, pair_sketch
 from porrima.drawing import drawing, svg_of
 from porrima.figures import at_one_fraction, effect_of_n_stars, errors_and_biases, toy_maps
-from porrima.files import write_whole
+from porrima.files import write_json, write_whole
 from porrima.galaxy import Robin2003
 from porrima.instruments import KCM16
 from porrima.io import write_figure, write_rows
@@ -156,16 +155,8 @@ def _write_claims(
     for name, records in zip(("claims", "claim_numbers"), both.values(), strict=True):
         if records:
             write_rows([dict(record) for record in records], folder / f"{name}.ecsv")
-    whole = {
-        name: [{key: _or_null(value) for key, value in record.items()} for record in records]
-        for name, records in both.items()
-    }
-    text = json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    write_whole(folder / "claims.json", lambda unfinished: unfinished.write_text(text, encoding="utf-8"))
-
-
-def _or_null(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    whole = {name: [dict(record) for record in records] for name, records in both.items()}
+    write_json(whole, folder / "claims.json")
 
 
 def _said(findings: xr.Dataset) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from porrima.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -20,7 +20,16 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int64]
     BoolArray = NDArray[np.bool_]
 
-__all__ = ["SKY_AREA", "CatalogRows", "NoOptions", "numbers", "parsed_options", "refuse", "table_area"]
+__all__ = [
+    "SKY_AREA",
+    "CatalogRows",
+    "NoOptions",
+    "numbers",
+    "parsed_options",
+    "refuse",
+    "refuse_unless",
+    "table_area",
+]
 
 SKY_AREA = 41253.0
 """Solid angle of the whole sky, in deg² (4π sr, rounded up)."""
@@ -105,6 +114,42 @@ def refuse(path: Path, row: IntArray, column: str, values: FloatArray, bad: Bool
         k = int(np.argmax(bad))
         value = "nothing" if np.isnan(values[k]) else f"{values[k]:.10g}"
         raise InputError(rule, source=path, row=int(row[k]), column=column, value=value)
+
+
+def refuse_unless(
+    path: Path,
+    row: IntArray,
+    values: Mapping[str, FloatArray],
+    rules: Iterable[tuple[str, str, BoolArray]],
+) -> None:
+    """Nothing, where the columns of a user's table keep all rules.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for the message.
+    row : (n,) int array
+        Number of each row, dimensionless.
+    values : mapping of str to (n,) float array
+        Columns by name, in the units that the message shows.
+    rules : iterable of (str, str, (n,) bool array)
+        Name of a column, the rule, and the rows that keep it.
+
+    Returns
+    -------
+    None
+        The check has no result.
+
+    Raises
+    ------
+    InputError
+        Names the first row that breaks the first rule that is broken.
+    """
+    for name, rule, good in rules:
+        if not np.all(good):
+            k = int(np.argmin(good))
+            value = f"{values[name][k]:.10g}"
+            raise InputError(rule, source=path, row=int(row[k]), column=name, value=value)
 
 
 def numbers(path: Path, column: str, texts: list[str], row: IntArray) -> FloatArray:

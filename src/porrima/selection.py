@@ -13,7 +13,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from porrima.errors import InputError
-from porrima.tables import column_values, load_table, open_catalog
+from porrima.rows import refuse_unless
+from porrima.tables import load_table, named_columns, open_catalog
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,14 +24,16 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
     IntArray = NDArray[np.int64]
 
-__all__ = [
-    "SHARP", "Combined", "HardCut", "Layer", "Selection", "SelectionTable", "probability_layer", "read_selection",
-]  # fmt: skip
+__all__ = ["SHARP", "Combined", "Layer", "Selection", "SelectionTable", "probability_layer", "read_selection"]
 
 SHARP = 1e-6
 """Relative width of an edge that has none of its own (dimensionless)."""
 
 _AXES = ("magnitude", "contrast", "separation")
+_OWN = {  # how a table may say how bright companions are: unit, rule and largest value
+    "contrast": ("mag", "must be from 0 to 30 mag", 30.0),
+    "flux_ratio": ("", "must be in [0, 1]", 1.0),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,53 +99,6 @@ def probability_layer(
     """
     m, f, r = np.meshgrid(magnitude, flux_ratio, separation, indexing="ij")
     return Layer(score=selection.rejected(r, f, m), normal=False)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HardCut:
-    """Pairs at or beyond a separation are recognised, all others and single stars kept.
-
-    Parameters
-    ----------
-    separation : float
-        In arcsec, positive.
-    """
-
-    separation: float
-
-    def rejected(self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray) -> FloatArray:
-        """Probability to be rejected.
-
-        Parameters
-        ----------
-        separation, flux_ratio, magnitude : (n,) float array
-            In arcsec, dimensionless and mag; the last two play no part.
-
-        Returns
-        -------
-        probability : (n,) float array
-            0 or 1, in [0, 1].
-        """
-        beyond, _, _ = np.broadcast_arrays(separation >= self.separation, flux_ratio, magnitude)
-        return beyond.astype(float)
-
-    def layers(
-        self, separation: FloatArray, flux_ratio: FloatArray, magnitude: FloatArray
-    ) -> tuple[Layer, ...]:
-        """The edge on a grid.
-
-        Parameters
-        ----------
-        separation, flux_ratio, magnitude : (n_r,), (n_f,), (n_m,) float array
-            In arcsec, dimensionless and mag.
-
-        Returns
-        -------
-        layers : tuple of Layer
-            One, dimensionless.
-        """
-        score = ((separation / self.separation) ** 2 - 1) / SHARP
-        return (Layer(score=np.tile(score, (1, flux_ratio.size, 1)), normal=True),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -324,33 +280,20 @@ def read_selection(path: Path) -> SelectionTable:
         If a column is missing, a value breaks its rule, or the grid has gaps: names row or column.
     """
     table, row = load_table(open_catalog(path, {}, None))
-    own = "contrast" if "contrast" in table.colnames else "flux_ratio"
-    units = {"separation": "arcsec", own: "mag" if own == "contrast" else "", "probability": ""}
-    values = {}
-    for name, unit in (units | {"magnitude": "mag"}).items():
-        if name in table.colnames:
-            values[name] = column_values(path, table[name], name, unit, row)
-        elif name != "magnitude":
-            names = ", ".join(table.colnames)
-            wanted = "contrast or flux_ratio" if name == own else name
-            raise InputError(f"is missing; the table has {names}", source=path, column=wanted)
-    if not len(table):
-        raise InputError("must have rows below its header", source=path)
+    own = next((name for name in _OWN if name in table.colnames), " or ".join(_OWN))
+    unit, rule, largest = _OWN.get(own, _OWN["contrast"])
+    needed = {"separation": "arcsec", own: unit, "probability": ""}
+    values = named_columns(path, table, row, needed, {"magnitude": "mag"})
     values.setdefault("magnitude", np.zeros(len(table)))
     _refuse_dimensional(path, table, own)
     r, p, m, c = (values[name] for name in ("separation", "probability", "magnitude", own))
-    good = {
-        "separation": ("must be from 0 to 10 arcsec", (r >= 0) & (r <= 10)),
-        own: ("must be from 0 to 30 mag", (c >= 0) & (c <= 30))
-        if own == "contrast"
-        else ("must be in [0, 1]", (c >= 0) & (c <= 1)),
-        "magnitude": ("must be finite", np.isfinite(m)),
-        "probability": ("must be in [0, 1]", (p >= 0) & (p <= 1)),
-    }
-    for name, (rule, fine) in good.items():
-        if not np.all(fine):
-            k = int(np.argmin(fine))
-            raise InputError(rule, source=path, row=int(row[k]), column=name, value=values[name][k])
+    rules = [
+        ("separation", "must be from 0 to 10 arcsec", (r >= 0) & (r <= 10)),
+        (own, rule, (c >= 0) & (c <= largest)),
+        ("magnitude", "must be finite", np.isfinite(m)),
+        ("probability", "must be in [0, 1]", (p >= 0) & (p <= 1)),
+    ]
+    refuse_unless(path, row, values, rules)
     single = (r == 0) | ((c == 0) & (own == "flux_ratio"))
     contrast = c if own == "contrast" else -2.5 * np.log10(np.where(single, 1.0, c)) + 0.0
     return _gridded(path, {"separation": r, "contrast": contrast, "magnitude": m}, p, row, single)

@@ -115,12 +115,6 @@ class ShearResponse:
         along = self.first[1, _YY] - self.first[1, _XX]
         return float(0.5 * (along - self.first[2, _XY])) / self.inverse_r2
 
-    @property
-    def c_of_size(self) -> tuple[float, float]:
-        r"""c1 and c2 over :math:`\langle x \rangle \langle 1/R_{gal}^2 \rangle`, dimensionless; 0 for a round PSF."""
-        c = (self.first[1:, _XX] + self.first[1:, _YY]) / (2 * self.inverse_r2)
-        return float(c[0]), float(c[1])
-
 
 def ellipticity_factors(mean_e2: float, responsivity: Responsivity) -> tuple[float, float]:
     r"""Factors on m and on c that the galaxies' own ellipticity makes.

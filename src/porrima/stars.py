@@ -156,6 +156,22 @@ class Stars:
     def __len__(self) -> int:
         return int(self.mass.size)
 
+    def evenly(self, n: int) -> Stars:
+        """So many of the stars, evenly through mass and, within alike masses, distance.
+
+        Parameters
+        ----------
+        n : int
+            How many, up to all of them (count).
+
+        Returns
+        -------
+        stars : Stars
+            Sorted by mass in steps of 0.1 dex, then by distance.
+        """
+        order = np.lexsort((self.distance, np.round(np.log10(self.mass), 1)))
+        return self.take(order[((np.arange(n) + 0.5) * len(self) / n).astype(np.int64)])
+
     def take(self, index: NDArray[Any]) -> Stars:
         """Stars at an index or under a mask.
 

@@ -80,7 +80,7 @@ def budget(
 ) -> None:
     """Share of a survey's requirements that unresolved binaries use, by magnitude."""
     from porrima.decision import decided
-    from porrima.ledger import BUDGET_COLUMNS, budget_lines, header_of, write_budget
+    from porrima.ledger import BUDGET_COLUMNS, budget_header, budget_lines, write_budget
 
     catalog, format = table_of(stars, catalog, format)  # noqa: A001
     result, found = decided(
@@ -91,7 +91,7 @@ def budget(
         selection=selection,
     )  # fmt: skip
     write_budget(result, output, plot)
-    show(result, as_json, header_of(result, multiplicity), BUDGET_COLUMNS, budget_lines(found))
+    show(result, as_json, budget_header(result, multiplicity), BUDGET_COLUMNS, budget_lines(found))
 
 
 Patches = Annotated[

@@ -33,6 +33,7 @@ __all__ = [
     "column_values",
     "load_columns",
     "load_table",
+    "named_columns",
     "open_catalog",
 ]
 
@@ -447,3 +448,43 @@ def _converted(values: FloatArray, own: Any, unit: str) -> FloatArray:
         return converted
     result: FloatArray = u.Quantity(values, own).to_value(unit)
     return result
+
+
+def named_columns(
+    path: Path, table: Any, row: IntArray, needed: Mapping[str, str], optional: Mapping[str, str]
+) -> dict[str, FloatArray]:
+    """Columns of a user's table, by name.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for the message.
+    table : astropy.table.Table
+        The table, from `load_table`.
+    row : (n,) int array
+        Number of each row, dimensionless.
+    needed, optional : mapping of str to str
+        Names, and the internal unit of each as `column_values` takes it.
+
+    Returns
+    -------
+    values : dict of (n,) float array
+        Those that are there, in their units.
+
+    Raises
+    ------
+    InputError
+        If one that is needed is missing, there are no rows, or a value is no number.
+    """
+    for name in needed:
+        if name not in table.colnames:
+            names = ", ".join(table.colnames)
+            raise InputError(f"is missing; the table has {names}", source=path, column=name)
+    if not len(table):
+        raise InputError("must have rows below its header", source=path)
+    units = {**needed, **optional}
+    return {
+        name: column_values(path, table[name], name, unit, row)
+        for name, unit in units.items()
+        if name in table.colnames
+    }

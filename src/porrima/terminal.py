@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from contextlib import contextmanager
@@ -14,6 +13,8 @@ from rich import box, progress
 from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
+
+from porrima.files import json_ready
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -149,7 +150,7 @@ def show(
         It goes to standard output.
     """
     if as_json:
-        print(json.dumps(_plain(result), allow_nan=False))
+        print(json.dumps(json_ready(result), allow_nan=False))
         return
     grid = Table(
         *(Column(Text(column)) for column in columns), box=box.SIMPLE_HEAD
@@ -159,14 +160,3 @@ def show(
     console = Console(width=None if sys.stdout.isatty() else 200)
     console.print(header, markup=False, highlight=False)
     console.print(grid)
-
-
-def _plain(value: Any) -> Any:
-    """A result as JSON has it: no numpy types, null for what is not a finite number."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value

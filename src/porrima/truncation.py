@@ -61,12 +61,6 @@ class KeptShapes:
     noise: FloatArray
     follows: FloatArray
 
-    @property
-    def variance(self) -> FloatArray:
-        """Of what one star adds to a stack, (k, 3), dimensionless."""
-        total: FloatArray = self.scatter + self.noise
-        return total
-
 
 def kept_shapes(
     sizes: OwnSizes,

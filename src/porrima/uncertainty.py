@@ -242,10 +242,10 @@ def _changes(
     judge: _Judge, stars: Stars, models: dict[str, Any], row_errors: tuple[RowErrors, ...], cut_error: float
 ) -> tuple[list[Source], FloatArray]:
     """Sources of errors and choices, and the changes by all combinations of the choices, (n, n_name)."""
-    some = _thinned(stars, MOST_STARS)
+    some = _at_most(stars, MOST_STARS)
     base = Population.of(some, **models)
     if len(base.stars) > MOST_STARS:
-        some = _thinned(stars, FEW_STARS)
+        some = _at_most(stars, FEW_STARS)
         base = Population.of(some, **models)
     start = _rough(base)
     reference = judge.raw(base, start)
@@ -266,7 +266,7 @@ def _changes(
 
 def _other_models(judge: _Judge, stars: Stars, models: dict[str, Any]) -> dict[str, FloatArray]:
     """Quantities by each compilation but the one in use, by name."""
-    few, out = _thinned(stars, FEW_STARS), {}
+    few, out = _at_most(stars, FEW_STARS), {}
     base = Population.of(few, **models)
     reference = judge.raw(base, _rough(base))
     for name in COMPILATIONS:
@@ -277,13 +277,9 @@ def _other_models(judge: _Judge, stars: Stars, models: dict[str, Any]) -> dict[s
     return out
 
 
-def _thinned(stars: Stars, most: int) -> Stars:
-    """At most so many stars, evenly through mass and, within alike masses, distance."""
-    if len(stars) <= most:
-        return stars
-    alike = np.round(np.log10(stars.mass), 1)
-    order = np.lexsort((stars.distance, alike))
-    return stars.take(order[((np.arange(most) + 0.5) * len(stars) / most).astype(np.int64)])
+def _at_most(stars: Stars, most: int) -> Stars:
+    """The stars, or so many of them where there are more."""
+    return stars if len(stars) <= most else stars.evenly(most)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

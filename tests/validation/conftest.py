@@ -1,4 +1,7 @@
-"""Validation tests can write what they measured: ``pytest tests/validation --write-validation``."""
+"""Validation tests can write what they measured: ``pytest tests/validation --write-validation``.
+
+Of some files alone, they write the sections that these measure anew and leave the others on the page.
+"""
 
 import re
 from pathlib import Path
@@ -40,19 +43,32 @@ def full_size(request):
     return request.config.getoption("--write-validation")
 
 
-def _number(section):
-    """Headings begin with their place on the page."""
-    number, letter = re.match(r"(\d+)(\w*)", section[0]).groups()
-    return int(number), letter
+def _place(number):
+    """Sections begin with their place on the page, 2 before 2b before 10."""
+    figure, letter = re.match(r"(\d+)(\w*)", number).groups()
+    return int(figure), letter
+
+
+def _section(heading, columns, lines):
+    """A section of the page, and its number."""
+    title, _, words = heading.partition(": ")
+    number, _, title = title.partition(" ")
+    text = f"<!-- {number} -->\n## {title}\n\n{words}\n\n| " + " | ".join(columns) + " |\n"
+    text += "|" + " --- |" * len(columns) + "\n"
+    return number, text + "".join("| " + " | ".join(map(str, line)) + " |\n" for line in lines)
 
 
 def pytest_sessionfinish(session, exitstatus):
     if not session.config.getoption("--write-validation") or exitstatus:
         return
-    text = HEAD
-    for heading, (columns, lines) in sorted(session.config.stash[SECTIONS].items(), key=_number):
-        title, _, words = heading.partition(": ")
-        text += f"\n## {title.split(' ', 1)[1]}\n\n{words}\n\n| " + " | ".join(columns) + " |\n"
-        text += "|" + " --- |" * len(columns) + "\n"
-        text += "".join("| " + " | ".join(map(str, line)) + " |\n" for line in lines)
+    sections = {}
+    if {item.path for item in session.items} != set(PAGE.parents[1].glob("tests/validation/test_*.py")):
+        parts = re.split(r"^<!-- (\w+) -->$", PAGE.read_text(encoding="utf-8"), flags=re.M)
+        sections = {
+            number: f"<!-- {number} -->{text.rstrip()}\n"
+            for number, text in zip(parts[1::2], parts[2::2], strict=True)
+        }
+    measured = session.config.stash[SECTIONS].items()
+    sections |= dict(_section(heading, *table) for heading, table in measured)
+    text = "\n".join([HEAD, *(sections[number] for number in sorted(sections, key=_place))])
     PAGE.write_text(text, encoding="utf-8")

@@ -15,7 +15,7 @@ import pytest
 CHUNK, KILLS = 100, 20
 CONFIG = "stars: {{l: 180, b: 45, mag: [18, 19], n_drawn: 2000}}\nn_stacks: {}\nn_stars: {}\n"
 KILLED = (
-    "20 Interruptions: `porrima simulate` of 40 000 stacks in chunks of 100, each process killed with SIGKILL at a "
+    "20 Interruptions: `porrima simulate` of 80 000 stacks in chunks of 100, each process killed with SIGKILL at a "
     "random moment from its start to its fifteenth chunk or so, then started again with `--resume`; and "
     "workers of one run killed with SIGKILL.  The store at the end against that of an uninterrupted run, byte by byte; "
     "a chunk is lost that was begun and is not complete."
@@ -61,7 +61,7 @@ def wait_for(n, path, process):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, full_size):
     """Folder with a configuration and the store of a whole run, its stacks, and the time to its first chunk."""
-    folder, n_stacks = tmp_path_factory.mktemp("whole"), 40_000 if full_size else 16_000
+    folder, n_stacks = tmp_path_factory.mktemp("whole"), 80_000 if full_size else 24_000
     (folder / "run.yaml").write_text(CONFIG.format(n_stacks, 40))
     done(command("simulate", folder / "run.yaml", "-o", folder / "first.zarr", "--chunk", CHUNK))  # compiles
     start = time.monotonic()
