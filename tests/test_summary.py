@@ -112,15 +112,22 @@ def test_stored_tallies_say_what_the_stacks_themselves_say(run, bins):
     np.testing.assert_array_equal(stored["n_stacks"], counted["n_stacks"])
 
 
-@pytest.mark.parametrize("bins", [1, 7, 20])
-def test_every_number_is_that_of_the_stacks_of_the_bin_taken_alone(run, bins):
-    """Against plain numpy on all stacks, each prediction at the stack's own binary fraction."""
+@pytest.fixture(scope="module")
+def one_by_one(run):
+    """Binary fraction and changes of each stack, and the prediction at its own binary fraction."""
     dataset = run.dataset
     shapes, alone = (np.stack([dataset[f"{q}{end}"] for q in ("e1", "e2", "r2")]) for end in ("", "_0"))
-    fraction, change = dataset["binary_fraction"].to_numpy(), changes(shapes, alone)
+    fraction = dataset["binary_fraction"].to_numpy()
     order = np.argsort(fraction)
     curves = predicted_curves(run.population, run.config, 40, fraction[order])
     bias, sd = (curves[name].to_numpy()[:, :, np.argsort(order)] for name in ("bias", "sd"))
+    return fraction, changes(shapes, alone), bias, sd
+
+
+@pytest.mark.parametrize("bins", [1, 7, 20])
+def test_every_number_is_that_of_the_stacks_of_the_bin_taken_alone(run, one_by_one, bins):
+    """Against plain numpy on all stacks."""
+    fraction, change, bias, sd = one_by_one
     found = summarise(run, bins)
     for k in range(bins):
         here = (fraction >= k / bins) & (fraction < (k + 1) / bins)

@@ -61,7 +61,7 @@ def wait_for(n, path, process):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, full_size):
     """Folder with a configuration and the store of a whole run, its stacks, and the time to its first chunk."""
-    folder, n_stacks = tmp_path_factory.mktemp("whole"), 80_000 if full_size else 24_000
+    folder, n_stacks = tmp_path_factory.mktemp("whole"), 80_000 if full_size else 12_000
     (folder / "run.yaml").write_text(CONFIG.format(n_stacks, 40))
     done(command("simulate", folder / "run.yaml", "-o", folder / "first.zarr", "--chunk", CHUNK))  # compiles
     start = time.monotonic()
@@ -75,7 +75,7 @@ def whole(tmp_path_factory, full_size):
 
 
 def test_kills_at_random_moments_of_a_run_change_no_byte(whole, full_size, tmp_path, record):
-    (folder, n_stacks, first), kills = whole, KILLS if full_size else KILLS // 4
+    (folder, n_stacks, first), kills = whole, KILLS if full_size else 3
     path, rng = tmp_path / "run.zarr", np.random.Generator(np.random.Philox(20261123))
     lost, at_work = [], 0
     for _ in range(kills):
@@ -106,7 +106,7 @@ def test_kills_at_random_moments_of_a_run_change_no_byte(whole, full_size, tmp_p
     record(KILLED, columns, ["the command", kills, at_work, max(lost), 0])
 
 
-def test_killed_workers_and_a_killed_client_change_no_byte(whole, tmp_path, record):
+def test_killed_workers_and_a_killed_client_change_no_byte(whole, full_size, tmp_path, record):
     folder, n_stacks, _ = whole
     path, rng, kills = tmp_path / "run.zarr", np.random.Generator(np.random.Philox(20261124)), 0
     arguments = ("simulate", folder / "run.yaml", "-o", path, "--resume", "--workers", 2, "--chunk", CHUNK)
@@ -128,7 +128,7 @@ def test_killed_workers_and_a_killed_client_change_no_byte(whole, tmp_path, reco
             process.kill()
             process.communicate()
     done(process)
-    assert kills > 3
+    assert kills > (3 if full_size else 1)
     assert contents(path) == contents(folder / "run.zarr")
     columns = [
         "killed",
@@ -152,7 +152,7 @@ def test_memory_does_not_grow_with_the_number_of_stacks(tmp_path, full_size, rec
     file, peaks = tmp_path / "first.yaml", {}
     file.write_text(CONFIG.format(1000, 40))
     done(command("simulate", file, "-o", tmp_path / "first.zarr"))  # compiles
-    for n_stacks in (100_000, 1_000_000) if full_size else (40_000, 400_000):
+    for n_stacks in (100_000, 1_000_000) if full_size else (30_000, 300_000):
         file, path = tmp_path / f"{n_stacks}.yaml", tmp_path / f"{n_stacks}.zarr"
         file.write_text(CONFIG.format(n_stacks, 40))
         peaks[n_stacks] = {

@@ -20,6 +20,7 @@ from porrima.stack import draw_stacks
 from statistics_helpers import assert_within_sigma
 
 FRACTION = 0.35
+AT_ONCE = 500_000  # stacks
 STARS = "16 Stars rejected by their own shape: {}."
 CLIPPED = STARS.format(
     "18 to 19 mag, 35 % pairs, `psf0`, adaptive; ten million stars drawn, measured and clipped one by one against the "
@@ -50,13 +51,13 @@ def mean_and_error(values):
 
 
 @pytest.fixture(scope="module")
-def single_stars(reply):
+def single_stars(reply, full_size):
     """x [arcsec²] and change of shape of single stars, most of them without a companion."""
-    stars = population("dk13")
+    stars, n = population("dk13"), 10_000_000 if full_size else 2_500_000
     x, change = [], []
-    for first in range(0, 10_000_000, 2_000_000):
+    for first in range(0, n, AT_ONCE):
         moments = draw_stacks(
-            stars, n_stars=1, binary_fraction=FRACTION, seed=11, first=first, last=first + 2_000_000
+            stars, n_stars=1, binary_fraction=FRACTION, seed=11, first=first, last=first + AT_ONCE
         ).moments
         some = moments.values[:, 0] + moments.values[:, 2]
         shape, zero = reply.shapes(moments), reply.shape0
@@ -110,9 +111,7 @@ def test_what_a_clip_keeps_is_what_is_left_of_stars_clipped_one_by_one(
 def test_position_angle_can_be_averaged_behind_a_psf_that_is_not_round(single_stars, name, record):
     stars, x, _ = single_stars
     reply = response(psf_from_name(name), Adaptive())
-    moments = draw_stacks(
-        stars, n_stars=1, binary_fraction=FRACTION, seed=11, first=0, last=2_000_000
-    ).moments
+    moments = draw_stacks(stars, n_stars=1, binary_fraction=FRACTION, seed=11, first=0, last=AT_ONCE).moments
     shape, zero = reply.shapes(moments), reply.shape0
     kept = shape.r2 / zero.r2 - 1 <= 0.008
     theory = predicted(stars, Clip(response=reply, threshold=0.008))
@@ -128,10 +127,11 @@ def test_position_angle_can_be_averaged_behind_a_psf_that_is_not_round(single_st
 @pytest.mark.parametrize(
     ("quantity", "threshold", "sigma"), [("r2", 0.016, 0.0), ("r2", 0.008, 0.004), ("e", 0.008, 0.003)]
 )
-def test_the_engine_with_a_clip_agrees_with_the_closed_form(reply, quantity, threshold, sigma):
+def test_the_engine_with_a_clip_agrees_with_the_closed_form(reply, full_size, quantity, threshold, sigma):
     clip = Clip(response=reply, threshold=threshold, quantity=quantity, noise=Noise(sigma=(sigma,)))
     stars = replace(population("dk13"), selection=clip)
-    drawn = draw_stacks(stars, n_stars=1000, binary_fraction=FRACTION, seed=3, first=0, last=200_000)
+    last = 200_000 if full_size else 50_000
+    drawn = draw_stacks(stars, n_stars=1000, binary_fraction=FRACTION, seed=3, first=0, last=last)
     theory, values = predicted(stars, clip), drawn.moments.values
     for column in (0, 2, 7, 11):
         value, error = mean_and_error(values[:, column])
