@@ -228,7 +228,10 @@ def _draw_stack(  # type: ignore[no-untyped-def]
     """
     key_low, key_high = halves(seed)
     low, high = halves(stack)
-    stage, none = uint32(COUNT_STAGE), int64(0)  # no literals, for each of which functions would be compiled anew
+    stage, none = (
+        uint32(COUNT_STAGE),
+        int64(0),
+    )  # no literals, for each of which functions would be compiled anew
     wanted, draw = binomial(n_stars, fraction, key_low, key_high, stage, low, high, none)
     resolved, lost_draw = lost_singles(n_stars - wanted, loss, key_low, key_high, low, high, none)
     n_blocks, kept, total, lane = 0, 0, 0.0, LANES
