@@ -20,11 +20,12 @@ INDEPENDENCE = (
     "stacks, in standard errors: the next ones of the same run, those one batch, chunk and more later, and the same "
     "stacks of other seeds."
 )
-N_STARS, N_STACKS, CHUNK = 10_000, 100_000, 10_000
+N_STARS, CHUNK = 10_000, 10_000
 
 
 @pytest.mark.parametrize("model", ["dk13", "dk13-kcm16"])
-def test_the_mean_of_every_moment_over_a_thousand_million_stars(record, model):
+def test_the_mean_of_every_moment_over_a_thousand_million_stars(record, full_size, model):
+    n_stacks = 100_000 if full_size else CHUNK
     catalogue = {"catalog": data_file("catalogues/besancon_l200_b90.dat"), "mag": [18, 19]}
     config = parse(PopulationConfig, {"stars": catalogue, "multiplicity": model})
     population = population_of(config, draw_stars(config))
@@ -32,20 +33,20 @@ def test_the_mean_of_every_moment_over_a_thousand_million_stars(record, model):
     unit = np.array([0.05 ** (a + b) for a, b in INDICES])  # so that powers do not vanish
     powers = np.zeros((4, len(INDICES)))
     middle = expected.mean[0] / unit
-    for first in range(0, N_STACKS, CHUNK):
+    for first in range(0, n_stacks, CHUNK):
         run = {"n_stars": N_STARS, "binary_fraction": 0.35, "seed": 20261122}
         values = (
             draw_stacks(population, first=first, last=first + CHUNK, **run).moments.values / unit - middle
         )
-        powers += [np.sum(values**k, axis=0) / N_STACKS for k in (1, 2, 3, 4)]
+        powers += [np.sum(values**k, axis=0) / n_stacks for k in (1, 2, 3, 4)]
     mean, second, third, fourth = powers
     variance = second - mean**2
-    error = np.sqrt(variance / N_STACKS)
+    error = np.sqrt(variance / n_stacks)
     pull = mean / error
     assert np.abs(pull).max() < 5
     # the variance between stacks is that of one star over N, so stacks do not know of each other
     about_mean = fourth - 4 * mean * third + 6 * mean**2 * second - 3 * mean**4
-    error_of_variance = np.sqrt((about_mean - variance**2) / N_STACKS)
+    error_of_variance = np.sqrt((about_mean - variance**2) / n_stacks)
     predicted = np.diagonal(expected.covariance[0]) / N_STARS / unit**2
     pull_of_variance = (variance - predicted) / error_of_variance
     assert np.abs(pull_of_variance).max() < 5
@@ -58,7 +59,7 @@ def test_the_mean_of_every_moment_over_a_thousand_million_stars(record, model):
     record(ENGINE, columns, [model, *shown, *(f"{np.abs(p).max():.1f}" for p in (pull, pull_of_variance))])
 
 
-def test_stacks_chunks_and_seeds_do_not_know_of_each_other(record):
+def test_stacks_chunks_and_seeds_do_not_know_of_each_other(record, full_size):
     config = parse(PopulationConfig, {"stars": {"l": 180, "b": 45, "mag": [18, 19]}})
     population = population_of(config, draw_stars(config))
 
@@ -68,7 +69,7 @@ def test_stacks_chunks_and_seeds_do_not_know_of_each_other(record):
         x = np.log1p((values[:, 0] + values[:, 2]) / 1e-6)  # whose tail is not heavy
         return (x - x.mean()) / x.std()
 
-    n = 1_000_000
+    n = 1_000_000 if full_size else 200_000
     here = sizes(0, 5)
     others = {f"{lag} later": np.roll(here, -lag) for lag in (1, 2, 3, 64, 10_000)}
     others |= {f"2^{power} later": sizes(2**power, 5) for power in (20, 32)}

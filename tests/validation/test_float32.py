@@ -121,7 +121,8 @@ def statistics(change):
 
 
 @pytest.mark.parametrize(("n_stars", "fractions", "n_stacks"), [(40, "uniform", 20_000), (10_000, 0.35, 150)])
-def test_no_reported_figure_feels_float32(record, n_stars, fractions, n_stacks):
+def test_no_reported_figure_feels_float32(record, full_size, n_stars, fractions, n_stacks):
+    n_stacks = n_stacks if full_size else n_stacks // 3 // 50 * 50
     catalogue = {"catalog": data_file("catalogues/besancon_l200_b90.dat"), "mag": [18, 19]}
     config = parse(PopulationConfig, {"stars": catalogue})
     population = population_of(config, draw_stars(config))

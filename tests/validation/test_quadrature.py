@@ -93,7 +93,7 @@ def test_every_average_agrees_with_drawn_pairs(record, full_size, monkeypatch, w
     stars = POPULATIONS[where]() | {"mag": [18, 19]}
     config = parse(PopulationConfig, {"stars": stars, "multiplicity": model})
     stars = draw_stars(config)
-    population = population_of(config, stars if full_size else stars.take(np.arange(0, len(stars), 5)))
+    population = population_of(config, stars if full_size else stars.take(np.arange(0, len(stars), 12)))
     pair = population.law.multiplicity_fraction
     found = integrate(population)
     unit = population.cut ** np.array([0, *EVEN, *(n + m for n, m in PRODUCTS)])

@@ -134,7 +134,7 @@ def test_the_share_of_pairs_found_is_the_predicted_probability(record, full_size
     psf, exposures = survey_of(name, n_exposures)
     detection = Detection.of(psf, exposures, false_alarm=FALSE_ALARM)
     fit, rng = Fit(psf, exposures), np.random.Generator(np.random.PCG64(20261125 + n_exposures))
-    repeats = 100 if full_size else 3
+    repeats = 100 if full_size else 1
     systems = [system for system in GRID for _ in range(repeats)]
     limit = chi2.isf(FALSE_ALARM, 3)
     found = np.array([sample(psf, exposures, fit, system, rng)[0] > limit for system in systems])
@@ -151,7 +151,7 @@ def test_the_share_of_pairs_found_is_the_predicted_probability(record, full_size
     if full_size:
         p, n = predicted[::repeats], found.reshape(-1, repeats).sum(axis=1)
         assert_within_sigma(n, repeats * p, np.sqrt(repeats * p * (1 - p) + 1))
-    n_single = 4000 if full_size else 200
+    n_single = 4000 if full_size else 100
     alarms = sum(
         sample(psf, exposures, fit, (0.0, 0.0, 17 + 2 * (k % 4)), rng)[0] > limit for k in range(n_single)
     )
