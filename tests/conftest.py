@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ SOURCE = hashlib.sha256(
 ).hexdigest()
 os.environ["NUMBA_CACHE_DIR"] = str(ROOT / ".numba_cache" / SOURCE[:16])
 
+from porrima import cli
 from porrima.multiplicity import MULTIPLICITY
 from porrima.photometry import PHOTOMETRY
 from porrima.stars import Stars
@@ -26,6 +28,20 @@ def own_cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PORRIMA_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture
+def porrima(monkeypatch, capsys):
+    """Run a command in this process; gives exit code, standard output and standard error."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["porrima", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        out, err = capsys.readouterr()
+        return stop.value.code, out, err
+
+    return run
 
 
 @pytest.fixture(scope="session")

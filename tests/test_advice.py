@@ -2,6 +2,7 @@
 
 import json
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,17 +14,9 @@ SHORT = ("--clip", 0.05, "--clip", 0.01, "--clip", 0.005, "--exposures", 1, "--e
 
 
 @pytest.fixture
-def porrima(monkeypatch, capsys):
+def porrima(porrima):
     """Run `porrima select`; gives exit code, standard output and standard error."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["porrima", "select", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        out, err = capsys.readouterr()
-        return stop.value.code, out, err
-
-    return run
+    return partial(porrima, "select")
 
 
 @pytest.fixture(scope="module")

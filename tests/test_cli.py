@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from porrima import cli
 from porrima.catalogs import read_catalog
 from porrima.diagrams import colour_against_eta
 from porrima.errors import RunError
@@ -19,20 +18,6 @@ PREDICT_KEYS = {
     "sd_r2", "n_stars", "binary_fraction", "unresolved_fraction", "removed_fraction",
 }  # fmt: skip
 CONFIG = "stars: {{catalog: {stars}, mag: [18, 19]}}\nn_stacks: 500\nn_stars: 10\nestimator: plain\n"
-
-
-@pytest.fixture
-def porrima(monkeypatch, capsys):
-    """Run a command in this process; gives exit code, standard output and standard error."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["porrima", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        out, err = capsys.readouterr()
-        return stop.value.code, out, err
-
-    return run
 
 
 @pytest.fixture(scope="module")

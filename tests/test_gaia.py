@@ -10,7 +10,6 @@ import pytest
 
 from porrima import gaia
 from porrima.catalogs import read_catalog
-from porrima.cli import main
 from porrima.errors import InputError
 from porrima.gaia import distance_from_parallax, fetch_cone, mass_from_magnitude, sequence_magnitude
 from porrima.galaxy import Robin2003
@@ -319,20 +318,6 @@ def test_empty_cone_and_wrong_arguments_are_refused(tmp_path, archive):
 
 
 # ---------------------------------------------------------------- the command
-
-
-@pytest.fixture
-def porrima(monkeypatch, capsys):
-    """Run a command as the shell would: exit code, standard output and error."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["porrima", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        captured = capsys.readouterr()
-        return end.value.code, captured.out, captured.err
-
-    return run
 
 
 def test_command_fetches_counts_and_writes_stars_and_the_archive_s_table(tmp_path, archive, porrima):

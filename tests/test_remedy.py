@@ -1,13 +1,12 @@
 """`porrima correct` as a user types it: three methods, what is written, and wrong input in one line."""
 
 import json
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
 from astropy.table import Table
 
-from porrima import cli
 from porrima.psf import psf_from_name
 from porrima.response import response
 from porrima.shapes import Adaptive
@@ -21,17 +20,9 @@ CLIPS = "n_stars,r2,eta,sd\n1900,6.7806e-3,1.9e-4,1.1e-3\n1950,6.7817e-3,3.4e-4,
 
 
 @pytest.fixture
-def porrima(monkeypatch, capsys):
+def porrima(porrima):
     """Run `porrima correct`; gives exit code, standard output and standard error."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["porrima", "correct", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        out, err = capsys.readouterr()
-        return stop.value.code, out, err
-
-    return run
+    return partial(porrima, "correct")
 
 
 @pytest.fixture(scope="module")
